@@ -21,6 +21,7 @@ import typer
 from gsstream import API_VERSION, __version__
 from gsstream.cli.listing import plural, printable
 from gsstream.core.needs import install_extra
+from gsstream.core.processors import processors
 
 if TYPE_CHECKING:
     from gsstream.player.render import PlayerRenderer
@@ -60,7 +61,7 @@ def _say(what: str, text: str) -> None:
 
 
 def _processor() -> str:
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    usable = processors()
     info = Path("/proc/cpuinfo")
     facts: dict[str, str] = {}
     if info.is_file():

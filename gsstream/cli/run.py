@@ -17,6 +17,7 @@ from gsstream.cli.grouped import grouped
 from gsstream.cli.listing import fitting
 from gsstream.cli.open import server_beside, serving
 from gsstream.cli.streams import stream_file
+from gsstream.cli.working import working
 from gsstream.core.errors import ComponentError, GsstreamError, OutputError, RecipeError, SourceError
 
 if TYPE_CHECKING:
@@ -48,7 +49,8 @@ def run(
     """Encode a recording as a stream of 3D Gaussians.
 
     The recipe is the method's, changed by --recipe FILE, then by --set and the short options. Ctrl-C (exit code 130)
-    and SIGTERM (143) end after the current frame with a valid stream; --resume continues it to the same bytes.
+    and SIGTERM (143) end after the current frame with a valid stream, and at once before frame 0 is written; --resume
+    continues it to the same bytes.
     """
     from gsstream.core.needs import require_encoder
     from gsstream.engine.run.output import claim_output, disk_errors, ended_by_signals
@@ -67,15 +69,16 @@ def run(
     assembly = assemble(resolved, catalog)
     # Read before the folder is touched: --overwrite must not delete a run for the sake of a faulty recording.
     first = None if first_frame is None else read_first_frame(stream_file(first_frame))
-    recording = open_recording(source, assembly.recipe, catalog)
     wanted, quiet = shown.wanted(), shown.quiet
     say = _silent if quiet else _note
     if assembly.note:
         say(assembly.note)
+    with working("opening the recording", quiet):
+        recording = open_recording(source, assembly.recipe, catalog)
     try:
         named = bool(recipe.method or recipe.recipe)
         _reused_lines(say, resolved.recipe, recording.info, named=named, catalog=catalog)
-        _first_look(recording, source, again=resume)
+        _first_look(recording, source, quiet, again=resume)
         with claim_output(out, resume=resume, overwrite=overwrite), ended_by_signals() as came, serving(server):
             try:
                 with disk_errors(out):
@@ -83,6 +86,8 @@ def run(
             except GsstreamError as error:
                 _what_there_is(error, out, recording, wanted, quiet)
                 raise
+            except KeyboardInterrupt:
+                raise typer.Exit(128 + came[0] if came else 130) from None
             with disk_errors(out):
                 _pictures(result, recording, wanted, quiet, assembly.recipe.renderer.name == "reference")
     finally:
@@ -120,13 +125,15 @@ def _held_out(camera: str) -> str:
     return shlex.quote(f"data.test_cameras=[{name}]")
 
 
-def _first_look(recording: FrameSource, uri: str, *, again: bool) -> None:
+def _first_look(recording: FrameSource, uri: str, quiet: bool, *, again: bool) -> None:
     """Warn of poses that cannot be right before an hour is spent on them; not ``again`` when a run is resumed."""
     if again:
         return
     from gsstream.input.prepare.pose_checks import first_look
 
-    for finding in first_look(recording):
+    with working("looking at frame 0", quiet):
+        found = first_look(recording)
+    for finding in found:
         warnings.warn(f"[{finding.code}] {finding.message}. All checks: gsstream scene validate {uri}", stacklevel=2)
 
 
@@ -172,7 +179,7 @@ def _pictures(
 
     if result.frames == 0:
         return
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), working("drawing pictures", quiet):
         if warned:
             warnings.simplefilter("ignore", SlowRendererWarning)
         written = write_gallery(result.out, recording, **wanted)

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from gsstream.cli import options
+from gsstream.cli.working import working
 from gsstream.core.needs import page
 
 app = typer.Typer(
@@ -58,10 +59,12 @@ def prepare(
     began = time.perf_counter()
     model = lens.upper().replace("-", "_")
     options = PrepareOptions(tuple(test) if test else None, model, each, frames, width, fps=fps)
-    made = make(raw, out, options, lambda line: None if quiet else typer.echo(line))
-    # The features have just been matched; how well they fit is in the report.
-    found = find(lambda scale: open_source(str(out), scale), features=False)
-    written = write_report(out, made, found, time.perf_counter() - began)
+    with working("reading pictures", quiet) as signs:
+        made = make(raw, out, options, lambda line: None if quiet else typer.echo(line), signs.tell)
+        signs.tell("checking the scene")
+        # The features have just been matched; how well they fit is in the report.
+        found = find(lambda scale: open_source(str(out), scale), features=False)
+        written = write_report(out, made, found, time.perf_counter() - began)
     for finding in found:
         typer.echo(f"{finding.severity}: [{finding.code}] {finding.message}", err=True)
     if made.left_out:
@@ -91,9 +94,10 @@ def validate(
     if frames < 1:
         raise InputError(f"--frames: expected at least 1, got {frames}")
     catalog = load_catalog()
-    found = find(
-        lambda scale: open_recording(scene, Recipe(scale=scale), catalog), frames=frames, features=not no_features
-    )
+    with working("checking the scene"):
+        found = find(
+            lambda scale: open_recording(scene, Recipe(scale=scale), catalog), frames=frames, features=not no_features
+        )
     for finding in found:
         typer.echo(f"{finding.severity}: [{finding.code}] {finding.message}")
     errors = sum(finding.severity == "error" for finding in found)

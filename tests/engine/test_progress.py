@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+import re
+import time
 import warnings
 
 import pytest
 
+from gsstream.core.signs import Signs
 from gsstream.engine.run.progress import RunProgress
 
 
@@ -46,15 +50,33 @@ def test_hours_are_announced_once_and_early(capsys, quiet) -> None:
 def test_lines_say_what_is_left_once_the_pace_is_known(capsys) -> None:
     lines, announced = told(capsys, 0.5, 400, quiet=False)
     assert announced == []
-    assert "left" not in lines[0], "nobody knows after one iteration"
-    assert lines[1] == "frame 0: iteration 22/400, loss 0.1000, 100 Gaussians, about 3.1 minutes left"
+    assert lines[0] == "frame 0: iteration 8/400, loss 0.1000, 100 Gaussians, about 3.3 minutes left"
     assert lines[-1] == "frame 0: iteration 400/400, loss 0.1000, 100 Gaussians"
-    left = [float(line.split("about ")[1].split()[0]) for line in lines[1:-1] if "minutes" in line]
+    left = [float(line.split("about ")[1].split()[0]) for line in lines[:-1] if "minutes" in line]
     assert left == sorted(left, reverse=True)
     assert any("seconds left" in line for line in lines)
+    iterations = [int(re.search(r"iteration (\d+)", line)[1]) for line in lines]
+    assert max(b - a for a, b in itertools.pairwise([0, *iterations])) * 0.5 <= 5, "a sign at least every 5 seconds"
 
 
 def test_a_fast_frame_0_says_nothing_of_time(capsys) -> None:
     lines, announced = told(capsys, 0.001, 300, quiet=False)
     assert announced == []
     assert not any("left" in line for line in lines)
+
+
+def test_work_that_says_nothing_is_shown_every_few_seconds(capsys: pytest.CaptureFixture[str]) -> None:
+    """The clock runs a thousand times too fast; the thread that looks at it does not."""
+    start = time.monotonic()
+    with Signs(False, lambda: 1000 * (time.monotonic() - start)) as signs:
+        signs.tell("looking for points", 3, 50)
+        deadline = time.monotonic() + 60
+        said = ""
+        while said.count("\n") < 2 and time.monotonic() < deadline:
+            time.sleep(0.05)
+            said += capsys.readouterr().err
+    assert re.fullmatch(r"(looking for points: 3/50, [\d.]+ (seconds|minutes) on this one\n)+", said)
+    with Signs(True, lambda: 1000 * time.monotonic()) as signs:
+        signs.tell("looking for points", 3, 50)
+        time.sleep(0.6)
+    assert capsys.readouterr().err == ""

@@ -120,13 +120,12 @@ def test_damage_in_the_middle_is_not_cut_away(tmp_path: Path, capsys: pytest.Cap
     assert stream.read_bytes() == data
 
 
-@pytest.mark.parametrize("moment", ["frame 0", "later"])
-def test_interrupt_ends_after_the_current_frame(tmp_path: Path, moment: str) -> None:
+def test_interrupt_ends_after_the_current_frame(tmp_path: Path) -> None:
     """Ctrl-C: code 130, a stream that plays, and --resume goes on to the bytes of an undisturbed run."""
     source, out = WORLD.replace("frames=6", "frames=40"), tmp_path / "o"
     options = {"source": source, "stream__epochs": 10}
     process = start(*arguments(out, pictures=True, **options))
-    wait_for((out / ("stream.gss" if moment == "frame 0" else "metrics.jsonl")).exists, process)
+    wait_for((out / "metrics.jsonl").exists, process)
     os.kill(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=600)
     assert process.returncode == 130, err
@@ -140,16 +139,30 @@ def test_interrupt_ends_after_the_current_frame(tmp_path: Path, moment: str) -> 
     assert (out / "contact_sheet.png").exists()
 
 
-def test_interrupted_twice_it_stops_at_once(tmp_path: Path) -> None:
-    """A second Ctrl-C does not wait for frame 0, which would take hours here."""
+ENDS = [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "ended by SIGTERM")]
+
+
+@pytest.mark.parametrize(("number", "code", "said"), ENDS)
+def test_before_the_first_packet_it_stops_at_once(tmp_path: Path, number: str, code: int, said: str) -> None:
+    """Nothing would be lost, and frame 0 would take hours here."""
     out, options = tmp_path / "o", {"first_frame__max_iterations": 10_000_000, "first_frame__epochs": 10_000_000}
     process = start(*arguments(out, **options))
     wait_for((out / "stream.gss").exists, process)
+    os.kill(process.pid, getattr(signal, number))
+    _, err = process.communicate(timeout=600)
+    assert (process.returncode, err) == (code, f"{said}\n")
+    with StreamReader(out / "stream.gss") as reader:
+        assert reader.entries == []
+        assert reader.damage is None
+
+
+def test_interrupted_twice_it_does_not_wait_for_the_frame(tmp_path: Path) -> None:
+    process = start(*arguments(out := tmp_path / "o", stream__epochs=10_000))
+    wait_for((out / "metrics.jsonl").exists, process)
     for _ in range(2):
         os.kill(process.pid, signal.SIGINT)
         time.sleep(0.2)
     _, err = process.communicate(timeout=600)
     assert (process.returncode, err) == (130, "interrupted\n")
     with StreamReader(out / "stream.gss") as reader:
-        assert reader.entries == []
-        assert reader.damage is None
+        assert [entry.frame for entry in reader.frames] == [0]

@@ -9,6 +9,7 @@ import numpy as np
 
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud, shrink_frame
+from gsstream.core.signs import Tell, silent
 from gsstream.engine.fit import schedule
 from gsstream.input.recordings.base import FrameSource, PointKind
 from gsstream.input.seeds.seeding import photo_consistent_seeds
@@ -22,7 +23,7 @@ SWEEP_WIDTH = 160
 
 
 def gather_points(
-    shipped: Callable[[PointKind], PointCloud | None], frame: Frame, settings: FirstFrame
+    shipped: Callable[[PointKind], PointCloud | None], frame: Frame, settings: FirstFrame, tell: Tell = silent
 ) -> PointCloud:
     """Return the points to seed from. Only the cameras of ``frame`` take part, and points that the source vouches for.
 
@@ -30,7 +31,7 @@ def gather_points(
     """
     pixels = frame.images[..., 0].size
     limit = min(settings.max_points, max(1, pixels // schedule.PIXELS_PER_SEED))
-    return thin_points(_base_points(shipped, frame, settings), limit)
+    return thin_points(_base_points(shipped, frame, settings, tell), limit)
 
 
 def with_test_views(source: FrameSource, frame: Frame) -> Frame:
@@ -49,13 +50,13 @@ def with_test_views(source: FrameSource, frame: Frame) -> Frame:
 
 
 def _base_points(
-    ships: Callable[[PointKind], PointCloud | None], frame: Frame, settings: FirstFrame
+    ships: Callable[[PointKind], PointCloud | None], frame: Frame, settings: FirstFrame, tell: Tell
 ) -> PointCloud:
     wanted = settings.points
     if wanted == "sfm":
-        return _triangulate(frame)
+        return _triangulate(frame, tell)
     if wanted == "sweep":
-        return _sweep(frame, settings)
+        return _sweep(frame, settings, tell)
     shipped = ships("sparse" if wanted == "sparse" else "recording")
     if shipped is None and wanted != "auto":
         raise InputError(
@@ -65,7 +66,7 @@ def _base_points(
     if shipped is not None and (wanted != "auto" or len(shipped) >= SPARSE):
         return shipped
     try:
-        return _sweep(frame, settings)
+        return _sweep(frame, settings, tell)
     except InputError:  # fewer than three cameras, or views that agree nowhere
         if shipped is not None:
             return shipped
@@ -74,13 +75,13 @@ def _base_points(
         return shell_points(frame.images, frame.cameras)
 
 
-def _triangulate(frame: Frame) -> PointCloud:
+def _triangulate(frame: Frame, tell: Tell) -> PointCloud:
     from gsstream.input.seeds.sfm import triangulate_points
 
-    return triangulate_points(frame.images, frame.cameras)
+    return triangulate_points(frame.images, frame.cameras, tell=tell)
 
 
-def _sweep(frame: Frame, settings: FirstFrame) -> PointCloud:
+def _sweep(frame: Frame, settings: FirstFrame, tell: Tell) -> PointCloud:
     """Points that several training views agree on, found at most SWEEP_WIDTH pixels wide (time grows with pixels)."""
     small = shrink_frame(frame, -(-frame.cameras.width // SWEEP_WIDTH))
-    return photo_consistent_seeds(small.images, small.cameras, settings.max_points).points
+    return photo_consistent_seeds(small.images, small.cameras, settings.max_points, tell=tell).points

@@ -81,7 +81,7 @@ def run(
     listener, done = listener or RunListener(), state.prepare(resume)
     indices = itertools.count(done) if state.total is None else range(done, state.total)
     with (
-        _stop_on_interrupt(state.progress.say, source) as stop,
+        _stop_on_interrupt(state.progress.say, source, lambda: done > 0 or state.written > 0) as stop,
         # This is also the way when resuming finds no complete frame 0: the incomplete one is cut off and made again.
         StreamWriter.open(out / STREAM, resume=resume, last_frame=done - 1 if done else None) as state.writer,
         state.progress,
@@ -152,7 +152,7 @@ class _Run:
     def _seeds(self, frame: Frame) -> PointCloud:
         recipe = self.encoder.parts.recipe
         seen = with_test_views(self.source, frame) if recipe.data.leak == "points" else frame
-        points = gather_points(self.source.points, seen, recipe.first_frame)
+        points = gather_points(self.source.points, seen, recipe.first_frame, self.progress.tell)
         self.seeded = points.origin
         return points
 
@@ -216,19 +216,24 @@ def _timed(frames: Prefetcher, source: FrameSource) -> Iterator[tuple[Frame, Fra
 
 
 @contextmanager
-def _stop_on_interrupt(say: Callable[[str], None], source: FrameSource) -> Iterator[threading.Event]:
-    """First Ctrl-C: finish the frame in flight. Second: stop at once (the stream stays valid up to the last packet)."""
+def _stop_on_interrupt(
+    say: Callable[[str], None], source: FrameSource, begun: Callable[[], bool]
+) -> Iterator[threading.Event]:
+    """First Ctrl-C: finish the frame in flight. Second: stop at once (the stream stays valid up to the last packet).
+
+    Before there is a packet, which ``begun`` says, the first one stops at once: nothing would be lost.
+    """
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
 
     def handler(*_: object) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
         if isinstance(source, LiveSource):
             source.interrupt()  # the frame in flight may be one that is not captured yet
+        if stop.is_set() or not begun():
+            raise KeyboardInterrupt
+        stop.set()
         say("stopping after this frame; interrupt again to stop at once")
 
     previous = signal.signal(signal.SIGINT, handler)

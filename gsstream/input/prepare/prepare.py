@@ -21,6 +21,7 @@ from gsstream.core.errors import InputError, OutputError, suggest
 from gsstream.core.frame import PointCloud
 from gsstream.core.names import child
 from gsstream.core.shapes import FloatArray
+from gsstream.core.signs import Tell, silent
 from gsstream.input.prepare.given import GivenRig, read_raw
 from gsstream.input.prepare.raw import RawCamera, first_frames
 from gsstream.input.prepare.undistort import Undistortion, undistortion
@@ -72,11 +73,15 @@ class Prepared:
     known_poses: bool
 
 
-def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say) -> Prepared:
+def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say, tell: Tell = silent) -> Prepared:
     """Make the scene ``out`` (cameras.json, pictures, points_frame0.npz).
 
     Arguments:
         raw: a raw recording, or one of any layout that a run reads; poses and lenses that come with it are kept.
+        out: folder of the scene.
+        options: how it is made.
+        say: gets a sentence for every step.
+        tell: gets what is done, and how much of it.
 
     Raises SourceError for a raw recording that cannot be read, InputError when structure from motion fails or finds
     fewer than two training cameras, OutputError when ``out`` exists and is not an empty folder.
@@ -92,8 +97,8 @@ def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say) -> Pr
     say(f"{len(cameras)} cameras, {len(test)} of them for testing only; {'known' if known else 'unknown'} poses")
     say("reading frame 0")
     images = first_frames(cameras)
-    say(f"matching features of {len(cameras)} pictures; minutes for tens of cameras, longer for large pictures")
-    mapping = _map(cameras, images, known, test, options)
+    say(f"matching features of {len(cameras)} pictures; minutes for tens of cameras")
+    mapping = _map(cameras, images, known, test, options, tell)
     kept = [i for i, there in enumerate(mapping.registered) if there]
     if sum(names[i] not in test for i in kept) < 2:
         raise InputError(
@@ -108,7 +113,7 @@ def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say) -> Pr
     )  # fmt: skip
     points, bounds = _points(mapping, rig, options)
     say(f"kept {len(points)} points; writing pictures")
-    frames = _write_pictures([cameras[i] for i in kept], [lens for _, lens in lenses], out, options)
+    frames = _write_pictures([cameras[i] for i in kept], [lens for _, lens in lenses], out, options, tell)
     fps = known.fps if known else options.fps
     _write(out, title, rig, test, points, bounds, frames, fps, "" if known is None else known.licence)
     left_out = tuple(name for i, name in enumerate(names) if i not in kept)
@@ -117,21 +122,21 @@ def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say) -> Pr
 
 def _map(
     cameras: list[RawCamera], images: list[FloatArray], known: GivenRig | None, test: Sequence[str],
-    options: PrepareOptions,
+    options: PrepareOptions, tell: Tell,
 ) -> Mapping:  # fmt: skip
     one_size = len({camera.size for camera in cameras}) == 1
     held = [i for i, camera in enumerate(cameras) if camera.name in test]
     if known is None:
         # Pictures of different sizes come from different lenses.
         shared = one_size and not options.each
-        return reconstruct(images, model=options.model, shared=shared, held=held)
+        return reconstruct(images, model=options.model, shared=shared, held=held, tell=tell)
     training = [i for i in range(len(cameras)) if i not in held]
     size = _smallest([cameras[i] for i in training])
     flat = [_flat(images[i], cameras[i].size, known.lenses[i], size) for i in training]
     rig = Cameras(
         tuple(cameras[i].name for i in training), known.viewmats[training], np.stack([K for K, _ in flat]), *size
     )
-    found = triangulate(np.stack([image for _, image in flat]), rig)
+    found = triangulate(np.stack([image for _, image in flat]), rig, tell=tell)
     # The test cameras' poses are given; nothing of theirs is used.
     error, seen = np.full(len(cameras), np.nan), np.zeros(len(cameras), np.int64)
     error[training], seen[training] = found.camera_error, found.camera_points
@@ -200,11 +205,12 @@ def _points(mapping: Mapping, rig: Cameras, options: PrepareOptions) -> tuple[Po
 
 
 def _write_pictures(
-    cameras: list[RawCamera], lenses: list[Undistortion | None], out: Path, options: PrepareOptions
+    cameras: list[RawCamera], lenses: list[Undistortion | None], out: Path, options: PrepareOptions, tell: Tell
 ) -> int:
     """Pictures of all cameras; the number of frames that all of them have."""
     counts = []
-    for camera, lens in zip(cameras, lenses, strict=True):
+    for number, (camera, lens) in enumerate(zip(cameras, lenses, strict=True)):
+        tell("writing pictures: cameras", number, len(cameras))
         folder = child(out, camera.name)
         folder.mkdir(parents=True)
         if lens is None and camera.copied:

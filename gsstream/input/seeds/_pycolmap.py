@@ -1,4 +1,4 @@
-"""The one module that imports pycolmap: ``python -m gsstream.input.seeds._pycolmap TASK FOLDER`` in its own process.
+"""All that calls pycolmap, with ``_features``: ``python -m gsstream.input.seeds._pycolmap TASK FOLDER``, a process.
 
 zlib comes first on purpose: pycolmap 4.1 and later carry a zlib of their own, and when they are the first to load the
 system's one, the two mix and the next compression corrupts the heap. Loaded first, the system's zlib binds to itself.
@@ -6,7 +6,7 @@ system's one, the two mix and the next compression corrupts the heap. Loaded fir
 
 from __future__ import annotations
 
-import os
+import itertools
 import zlib  # noqa: F401  must precede pycolmap, see above
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,18 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-IMAGES, RIG, RESULT, MATCHES = "images", "rig.npz", "points.npz", "matches.npz"
+from gsstream.input.seeds._features import (
+    IMAGES,
+    MOST_FOR_ALL_PAIRS,
+    all_pairs,
+    extract,
+    match_pairs,
+    pairs_by_place,
+    pairs_in_order,
+    sign,
+)
+
+RIG, RESULT, MATCHES = "rig.npz", "points.npz", "matches.npz"
 
 
 def triangulate(folder: Path) -> None:
@@ -27,66 +38,16 @@ def triangulate(folder: Path) -> None:
     database = extract(folder, most=8192)
     with np.load(folder / RIG) as rig, pycolmap.Database.open(database) as db:
         reconstruction = _known_rig(db, rig["viewmats"], rig["Ks"], *map(int, rig["size"]))
-    match_all(database)
+        names = sorted(image.name for image in db.read_all_images())
+        pairs = all_pairs(folder) if len(names) <= MOST_FOR_ALL_PAIRS else pairs_by_place(names, rig["viewmats"])
+    match_pairs(folder, database, pairs)
+    sign(0, 0, "triangulating points")
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = 1, 0
     sparse = folder / "sparse"
     sparse.mkdir()
     reconstruction = pycolmap.triangulate_points(reconstruction, database, folder / IMAGES, sparse, options=options)
     np.savez(folder / RESULT, **_points_of(reconstruction))
-
-
-def extract(folder: Path, most: int, mode: str = "PER_IMAGE", model: str = "SIMPLE_RADIAL") -> Path:
-    """Find SIFT features of ``folder/images``, at most ``most`` per image; return the path of the new database.
-
-    Images are worked on at the same time, so they are finished in any order; the database that is returned has them in
-    the order of their names, and so the same input gives the same numbers whatever the machine.
-    """
-    pycolmap.set_random_seed(0)
-    scratch, database = folder / "features.db", folder / "database.db"
-    extraction, reader = pycolmap.FeatureExtractionOptions(), pycolmap.ImageReaderOptions()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    extraction.num_threads, extraction.use_gpu = cores, False
-    # Small images hold little contrast per octave; the stock threshold finds too few points below 640 pixels.
-    extraction.sift.peak_threshold, extraction.sift.max_num_features = 0.002, most
-    reader.camera_model = model
-    pycolmap.extract_features(
-        scratch, folder / IMAGES, camera_mode=getattr(pycolmap.CameraMode, mode), reader_options=reader,
-        extraction_options=extraction,
-    )  # fmt: skip
-    _in_order(scratch, database)
-    return database
-
-
-def _in_order(source: Path, target: Path) -> None:
-    """Copy cameras, images and features into a new database, numbered in the order of the images' names."""
-    cameras: dict[int, Any] = {}
-    rigs: dict[int, int] = {}
-    with pycolmap.Database.open(source) as old, pycolmap.Database.open(target) as new:
-        for image in sorted(old.read_all_images(), key=lambda image: image.name):
-            if image.camera_id not in cameras:
-                camera = old.read_camera(image.camera_id)
-                camera.camera_id = pycolmap.INVALID_CAMERA_ID
-                camera.camera_id = new.write_camera(camera)
-                rig = pycolmap.Rig()
-                rig.add_ref_sensor(camera.sensor_id)
-                cameras[image.camera_id], rigs[image.camera_id] = camera, new.write_rig(rig)
-            own = pycolmap.Image(name=image.name, camera_id=cameras[image.camera_id].camera_id)
-            own.image_id = number = new.write_image(own)
-            frame = pycolmap.Frame()
-            frame.rig_id = rigs[image.camera_id]
-            frame.add_data_id(own.data_id)
-            new.write_frame(frame)
-            new.write_keypoints(number, old.read_keypoints(image.image_id))
-            new.write_descriptors(number, old.read_descriptors(image.image_id))
-
-
-def match_all(database: Path) -> None:
-    """Match all pairs of images and verify each pair's geometry."""
-    matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
-    matching.num_threads, matching.use_gpu = 1, False
-    verification.ransac.random_seed = 0
-    pycolmap.match_exhaustive(database, matching_options=matching, verification_options=verification)
 
 
 def match(folder: Path) -> None:
@@ -97,7 +58,7 @@ def match(folder: Path) -> None:
     Writes ``folder/matches.npz``. Nothing is known about the cameras, so each pair is verified without calibration.
     """
     database = extract(folder, most=2048)
-    match_all(database)
+    match_pairs(folder, database, all_pairs(folder))
     pairs, counts, first, second = [], [], [np.zeros((0, 2))], [np.zeros((0, 2))]
     with pycolmap.Database.open(database) as db:
         images = sorted(db.read_all_images(), key=lambda image: image.name)
@@ -176,11 +137,20 @@ def reconstruct(folder: Path) -> None:
     with np.load(folder / "job.npz") as job:
         model, shared, held = str(job["model"]), bool(job["shared"]), {int(i) for i in job["held"]}
     database = extract(folder, most=4096, mode="SINGLE" if shared else "PER_IMAGE", model=model)
-    match_all(database)
+    names = sorted(path.name for path in (folder / IMAGES).iterdir())
+    pairs = all_pairs(folder) if len(names) <= MOST_FOR_ALL_PAIRS else pairs_in_order(names)
+    match_pairs(folder, database, pairs)
     with pycolmap.Database.open(database) as db:
         images = {int(Path(image.name).stem): image for image in db.read_all_images()}
         known = {index: db.read_camera(image.camera_id) for index, image in images.items()}
-    best = _map(folder, database, [image.name for index, image in sorted(images.items()) if index not in held])
+    free = [image.name for index, image in sorted(images.items()) if index not in held]
+    best = _map(folder, database, free, "first")
+    rest = sorted(set(all_pairs(folder)) - set(pairs))
+    if rest and (best is None or best.num_reg_images() < len(free)):
+        match_pairs(folder, database, rest)  # they were not taken one after the other
+        best = _map(folder, database, free, "second")
+    if best is None:
+        raise SystemExit("no pair of images shares enough features to begin with")
     poses = {int(Path(image.name).stem): image.cam_from_world() for image in best.images.values() if image.has_pose}
     cameras = {int(Path(image.name).stem): best.cameras[image.camera_id] for image in best.images.values()}
     held_error = np.full(len(images), np.nan)
@@ -201,8 +171,12 @@ def reconstruct(folder: Path) -> None:
     )
 
 
-def _map(folder: Path, database: Path, names: list[str]) -> Any:
-    """The mapping with most images, then least error, over a few settings: stock ones fail on few small images."""
+def _map(folder: Path, database: Path, names: list[str], turn: str) -> Any:
+    """The mapping with most images, then least error, over a few settings: stock ones fail on few small images.
+
+    None where no pair of images shares enough to begin with.
+    """
+    placed = itertools.count(3)
     best, rank = None, (0, 0.0)
     for attempt, (inliers, angle, least) in enumerate(((100, 16.0, 30), (40, 8.0, 15))):
         options = pycolmap.IncrementalPipelineOptions()
@@ -210,16 +184,19 @@ def _map(folder: Path, database: Path, names: list[str]) -> Any:
         options.image_names = names
         options.mapper.init_min_num_inliers, options.mapper.init_min_tri_angle = inliers, angle
         options.mapper.abs_pose_min_num_inliers = least
-        sparse = folder / f"sparse{attempt}"
+        sparse = folder / f"sparse-{turn}-{attempt}"
         sparse.mkdir()
-        for made in pycolmap.incremental_mapping(database, folder / IMAGES, sparse, options=options).values():
+        sign(0, 0, "placing cameras")
+        mapped = pycolmap.incremental_mapping(
+            database, folder / IMAGES, sparse, options=options,
+            next_image_callback=lambda: sign(min(next(placed), len(names)), len(names), "placing cameras: placed"),
+        )  # fmt: skip
+        for made in mapped.values():
             score = (made.num_reg_images(), -made.compute_mean_reprojection_error())
             if best is None or score > rank:
                 best, rank = made, score
         if rank[0] == len(names):
             break
-    if best is None:
-        raise SystemExit("no pair of images shares enough features to begin with")
     return best
 
 

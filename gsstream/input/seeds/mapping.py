@@ -13,6 +13,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
 from gsstream.core.shapes import BoolArray, FloatArray, IntArray
+from gsstream.core.signs import Tell, silent
 from gsstream.input.seeds.sfm import run_pycolmap, write_images, write_rig
 
 #: Number of focal lengths among the parameters of a lens model; the principal point follows, then the distortion.
@@ -68,7 +69,7 @@ class Mapping:
 
 def reconstruct(
     images: Sequence[FloatArray] | FloatArray, *, model: str = "SIMPLE_RADIAL", shared: bool = True,
-    held: Sequence[int] = (), timeout: float = 1800.0,
+    held: Sequence[int] = (), timeout: float = 1800.0, tell: Tell = silent,
 ) -> Mapping:  # fmt: skip
     """Map C images [H, W, 3] in [0, 1] of one instant; of different sizes, unless they share a lens.
 
@@ -80,14 +81,14 @@ def reconstruct(
         folder = Path(name)
         write_images(folder, images)
         np.savez(folder / "job.npz", model=model, shared=shared, held=np.array(held, np.int64))
-        run_pycolmap("reconstruct", folder, timeout)
+        run_pycolmap("reconstruct", folder, timeout, tell)
         with np.load(folder / "points.npz") as result:
             found = dict(result)
     lenses = tuple(Lens(model, tuple(map(float, params))) for params in found["cameras"])
     return _mapping(found, found["viewmats"], lenses)
 
 
-def triangulate(images: FloatArray, cameras: Cameras, *, timeout: float = 1800.0) -> Mapping:
+def triangulate(images: FloatArray, cameras: Cameras, *, timeout: float = 1800.0, tell: Tell = silent) -> Mapping:
     """Triangulate points of [C, H, W, 3] images in [0, 1] with known poses and pinhole lenses.
 
     Each comes with what every camera saw.
@@ -96,7 +97,7 @@ def triangulate(images: FloatArray, cameras: Cameras, *, timeout: float = 1800.0
         folder = Path(name)
         write_images(folder, images)
         write_rig(folder, cameras)
-        run_pycolmap("triangulate", folder, timeout)
+        run_pycolmap("triangulate", folder, timeout, tell)
         with np.load(folder / "points.npz") as result:
             found = dict(result)
     lenses = tuple(Lens("PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2])) for K in cameras.Ks)

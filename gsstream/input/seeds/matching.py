@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gsstream.core.shapes import FloatArray
+from gsstream.core.signs import Tell, silent
 from gsstream.input.seeds.sfm import run_pycolmap, write_images
 
 
@@ -21,7 +22,7 @@ class PairMatches:
     second: FloatArray
 
 
-def match_images(images: FloatArray, *, timeout: float = 900.0) -> list[PairMatches]:
+def match_images(images: FloatArray, *, timeout: float = 900.0, tell: Tell = silent) -> list[PairMatches]:
     """Match SIFT features of all pairs; keep those of one two-view geometry (fundamental matrix or homography).
 
     The same input gives the same matches. Raises InputError when pycolmap is not installed or its process fails.
@@ -29,7 +30,7 @@ def match_images(images: FloatArray, *, timeout: float = 900.0) -> list[PairMatc
     with tempfile.TemporaryDirectory(prefix="gsstream-match-") as name:
         folder = Path(name)
         write_images(folder, images)
-        run_pycolmap("match", folder, timeout)
+        run_pycolmap("match", folder, timeout, tell)
         with np.load(folder / "matches.npz") as result:
             pairs, counts, first, second = (result[key] for key in ("pairs", "counts", "first", "second"))
     ends = np.cumsum(counts)

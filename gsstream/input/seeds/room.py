@@ -8,7 +8,9 @@ perspective out of the comparison, so that cameras far apart can be compared. Tr
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations
 from typing import NamedTuple
 
@@ -19,9 +21,11 @@ import torch.nn.functional as F
 from gsstream.core.cameras import Cameras
 from gsstream.core.projection import inside, project
 from gsstream.core.shapes import BoolArray, FloatArray
+from gsstream.core.signs import Tell, silent
 from gsstream.input.seeds.fusion import agreement, world_points
 from gsstream.input.seeds.geometry import focus_point, neighbour_views, pixel_centers, spread_views
 from gsstream.input.seeds.window import window_mean
+from gsstream.input.seeds.workers import one_thread_each
 
 #: Degrees between two cameras, seen from what all look at, above which a rig stands in the room that it looks into.
 AROUND = 120.0
@@ -48,6 +52,24 @@ class Room(NamedTuple):
     floor: float
 
 
+class Search(NamedTuple):
+    """How many places a search begins at, how many steps follow from the best, and the factor from step to step."""
+
+    starts: int
+    tries: int
+    shrink: float
+
+    @property
+    def total(self) -> int:
+        """All places, those that lie outside of what is allowed included."""
+        return self.starts + self.tries
+
+
+SPHERE, FLOOR = Search(111, 150, 0.98), Search(91, 60, 0.95)
+#: How well the pictures agree on a surface [R, S, 3].
+Agrees = Callable[[FloatArray], float]
+
+
 class Match(NamedTuple):
     """Pixels of a view at some depth, [H, W] each: best correlation with another view, is one there, and texture."""
 
@@ -69,8 +91,9 @@ def stands_around(cameras: Cameras) -> bool:
 
 
 def with_room(
-    images: FloatArray, cameras: Cameras, swept: FloatArray, depths: FloatArray, accepted: BoolArray
-) -> tuple[FloatArray, BoolArray]:
+    images: FloatArray, cameras: Cameras, swept: FloatArray, depths: FloatArray, accepted: BoolArray,
+    tell: Tell = silent,
+) -> tuple[FloatArray, BoolArray]:  # fmt: skip
     """Return depths [C, H, W] of which those of the room stand in where the sweep is not sure, and which are seeds.
 
     A pixel gets no seed where another camera contradicts the wall: it sees the place, with texture, and other colours.
@@ -83,7 +106,7 @@ def with_room(
         accepted: [C, H, W] bool, where enough views agree with ``depths``.
     """
     support = agreement(swept, cameras, SUPPORT).support
-    room = room_depths(find_room(images, cameras), cameras)
+    room = room_depths(find_room(images, cameras, tell), cameras)
     partners = neighbour_views(cameras, MOST_CAMERAS)
     depths, kept = depths.copy(), accepted & (depths < IN_FRONT * room)
     for view in range(len(cameras)):
@@ -97,10 +120,11 @@ def with_room(
         taken = ~kept[view] & ~contradicted
         depths[view][taken] = room[view][taken]
         kept[view] |= taken
+        tell("looking for points: walls compared", view + 1, len(cameras))
     return depths, kept
 
 
-def find_room(images: FloatArray, cameras: Cameras) -> Room:
+def find_room(images: FloatArray, cameras: Cameras, tell: Tell = silent) -> Room:
     """Return the sphere and the floor on which pictures agree best; the same for the same pictures."""
     if len(cameras) > MOST_CAMERAS:
         chosen = spread_views(cameras, MOST_CAMERAS)
@@ -108,7 +132,13 @@ def find_room(images: FloatArray, cameras: Cameras) -> Room:
     grey = torch.from_numpy(np.ascontiguousarray(images.mean(-1)))
     focus = focus_point(cameras)
     size = float(np.linalg.norm(cameras.centers - focus, axis=1).mean())
-    return Room(*_sphere(grey, cameras, focus, size), *_floor(grey, cameras, focus, size))
+    counted = itertools.count(1)
+    with one_thread_each() as pool:
+        def agrees(surface: FloatArray) -> float:
+            tell("looking for points: rooms tried", next(counted), SPHERE.total + FLOOR.total)
+            return surface_agreement(grey, cameras, surface, pool)
+
+        return Room(*_sphere(agrees, cameras, focus, size), *_floor(agrees, cameras, focus, size))
 
 
 def room_depths(room: Room, cameras: Cameras) -> FloatArray:
@@ -133,9 +163,7 @@ def room_depths(room: Room, cameras: Cameras) -> FloatArray:
     return found.reshape(len(cameras), cameras.height, cameras.width)
 
 
-def _sphere(
-    grey: torch.Tensor, cameras: Cameras, focus: FloatArray, size: float
-) -> tuple[FloatArray, float]:
+def _sphere(agrees: Agrees, cameras: Cameras, focus: FloatArray, size: float) -> tuple[FloatArray, float]:
     """Middle and radius: about the focus, and no smaller than where the cameras stand."""
     latitude = (np.arange(72) + 0.5) / 72 * np.pi - np.pi / 2
     longitude = (np.arange(216) + 0.5) / 216 * 2 * np.pi
@@ -146,14 +174,14 @@ def _sphere(
         if values[3] < INSIDE * np.linalg.norm(cameras.centers - values[:3], axis=1).max():
             return -1.0
         away = float(np.linalg.norm(values[:3] - focus)) / (CENTER_SPREAD * size)
-        return surface_agreement(grey, cameras, values[:3] + values[3] * unit) * float(np.exp(-0.5 * away**2))
+        return agrees(values[:3] + values[3] * unit) * float(np.exp(-0.5 * away**2))
 
-    starts = [np.append(focus, radius) for radius in np.linspace(0.8, 3, 111) * size]
-    best = _climb(score, starts, np.full(4, 0.04 * size), tries=150, shrink=0.98)
+    starts = [np.append(focus, radius) for radius in np.linspace(0.8, 3, SPHERE.starts) * size]
+    best = _climb(score, starts, np.full(4, 0.04 * size), SPHERE)
     return best[:3], float(best[3])
 
 
-def _floor(grey: torch.Tensor, cameras: Cameras, focus: FloatArray, size: float) -> tuple[FloatArray, float]:
+def _floor(agrees: Agrees, cameras: Cameras, focus: FloatArray, size: float) -> tuple[FloatArray, float]:
     """Upward normal, from cameras held level, and the height of a plane below every camera."""
     across = cameras.viewmats[:, 0, :3]
     up = np.linalg.eigh(across.T @ across)[1][:, 0]
@@ -168,49 +196,56 @@ def _floor(grey: torch.Tensor, cameras: Cameras, focus: FloatArray, size: float)
     def score(values: FloatArray) -> float:
         if values[0] > highest:
             return -1.0
-        return surface_agreement(grey, cameras, focus + flat + values[0] * up)
+        return agrees(focus + flat + values[0] * up)
 
-    starts = [np.array([height]) for height in np.linspace(min(-1.2 * size, highest), highest, 91)]
-    best = _climb(score, starts, np.array([0.01 * size]), tries=60, shrink=0.95)
+    starts = [np.array([height]) for height in np.linspace(min(-1.2 * size, highest), highest, FLOOR.starts)]
+    best = _climb(score, starts, np.array([0.01 * size]), FLOOR)
     return up, float(focus @ up + best[0])
 
 
 def _climb(
-    score: Callable[[FloatArray], float], starts: list[FloatArray], step: FloatArray, tries: int, shrink: float
+    score: Callable[[FloatArray], float], starts: list[FloatArray], step: FloatArray, search: Search
 ) -> FloatArray:
     """Values of a high score: random steps, ever smaller ones, from the best of the starts."""
     values = [score(start) for start in starts]
     best, value = starts[int(np.argmax(values))], max(values)
     rng = np.random.default_rng(0)
-    for number in range(tries):
-        other = best + rng.normal(size=len(best)) * step * shrink**number
+    for number in range(search.tries):
+        other = best + rng.normal(size=len(best)) * step * search.shrink**number
         found = score(other)
         if found > value:
             best, value = other, found
     return best
 
 
-def surface_agreement(grey: torch.Tensor, cameras: Cameras, surface: FloatArray) -> float:
+def surface_agreement(
+    grey: torch.Tensor, cameras: Cameras, surface: FloatArray, pool: ThreadPoolExecutor
+) -> float:
     """Return how well pictures [C, H, W] agree on a surface [R, S, 3]: 0 to 1.
 
     It is the mean correlation, negative ones as 0, over all pairs of cameras and textured places; less where there are
-    few of them.
+    few of them. The same for any number of workers.
     """
     points, shape = surface.reshape(-1, 3), surface.shape[:2]
-    drawn = [_drawn_on(grey[view], cameras, view, points, shape) for view in range(len(grey))]
+    drawn = list(pool.map(lambda view: _drawn_on(grey[view], cameras, view, points, shape), range(len(grey))))
     shades, there = torch.stack([shade for shade, _ in drawn]), torch.stack([seen for _, seen in drawn])
     means, squares = window_mean(torch.stack([shades, shades * shades], 1), HALF).unbind(1)
     variance = (squares - means * means).clamp_min(0)
     # A window counts where all of it lies in the picture.
     usable = (window_mean(there.float()[:, None], HALF)[:, 0] > 0.99) & (variance > NOISE**2)
-    total, good = 0, 0.0
-    for a, b in combinations(range(len(grey)), 2):
+
+    def compared(pair: tuple[int, int]) -> tuple[int, float]:
+        a, b = pair
         both = usable[a] & usable[b]
         if not bool(both.any()):
-            continue
+            return 0, 0.0
         cross = window_mean((shades[a] * shades[b])[None, None], HALF)[0, 0] - means[a] * means[b]
         same = cross / ((variance[a] + NOISE**2) * (variance[b] + NOISE**2)).sqrt()
-        total, good = total + int(both.sum()), good + float(same[both].clamp_min(0).sum())
+        return int(both.sum()), float(same[both].clamp_min(0).sum())
+
+    total, good = 0, 0.0
+    for places, found in pool.map(compared, combinations(range(len(grey)), 2)):
+        total, good = total + places, good + found
     return good / max(total, 1) * min(1.0, total / ENOUGH)
 
 

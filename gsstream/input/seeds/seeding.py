@@ -13,6 +13,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
 from gsstream.core.frame import PointCloud
 from gsstream.core.shapes import FloatArray, check_finite, check_shape
+from gsstream.core.signs import Tell, silent
 from gsstream.input.seeds.fusion import agreement, color_gains, interpolate_depths, world_points
 from gsstream.input.seeds.room import stands_around, with_room
 from gsstream.input.seeds.sweep import SweepSettings, sweep_depths
@@ -44,6 +45,7 @@ def photo_consistent_seeds(
     tolerance: float = 0.015,
     min_support: int = 2,
     dominance: float = 1.0,
+    tell: Tell = silent,
 ) -> PhotoSeeds:
     """Find points that several views agree on: plane sweep, cross-view check, bridging of plain surfaces, thinning.
 
@@ -58,7 +60,8 @@ def photo_consistent_seeds(
             f"photo-consistent seeds: expected at least 3 training cameras and count >= 1, got {len(cameras)} cameras "
             f"and count {count}; give the recording points, or use structure from motion"
         )
-    swept = sweep_depths(images, cameras, SweepSettings() if settings is None else settings)
+    swept = sweep_depths(images, cameras, SweepSettings() if settings is None else settings, tell)
+    tell("looking for points: comparing what the cameras found", 0, 0)
     sure = agreement(swept, cameras, tolerance).accepted(min_support, dominance)
     if not sure.any():
         raise InputError(
@@ -76,7 +79,7 @@ def photo_consistent_seeds(
     origin = f"plane sweep of {len(cameras)} training views"
     if stands_around(cameras):
         origin += " and the room that they stand in"
-        depths, accepted = with_room(images, cameras, swept, depths, accepted)
+        depths, accepted = with_room(images, cameras, swept, depths, accepted, tell)
     xyz = np.concatenate([world_points(depths, cameras, i)[accepted[i].reshape(-1)] for i in range(len(cameras))])
     common = np.clip(images / gains[:, None, None, :], 0, 1)
     cloud = PointCloud(xyz.astype(np.float32), common[accepted], origin)

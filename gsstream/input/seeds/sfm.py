@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -17,10 +19,11 @@ from gsstream.core.errors import InputError
 from gsstream.core.frame import PointCloud
 from gsstream.core.needs import install_extra
 from gsstream.core.shapes import FloatArray, check_finite, check_shape
+from gsstream.core.signs import Tell, silent
 
 
 def triangulate_points(
-    images: FloatArray, cameras: Cameras, *, max_error: float = 2.0, timeout: float = 900.0
+    images: FloatArray, cameras: Cameras, *, max_error: float = 2.0, timeout: float = 900.0, tell: Tell = silent
 ) -> PointCloud:
     """Match SIFT features between all pairs of training images and triangulate them with the given poses.
 
@@ -35,7 +38,7 @@ def triangulate_points(
         folder = Path(name)
         write_images(folder, images)
         write_rig(folder, cameras)
-        run_pycolmap("triangulate", folder, timeout)
+        run_pycolmap("triangulate", folder, timeout, tell)
         with np.load(folder / "points.npz") as result:
             keep = np.isfinite(result["xyz"]).all(1) & (result["error"] <= max_error)
             xyz, rgb = result["xyz"][keep], result["rgb"][keep]
@@ -62,7 +65,7 @@ def write_rig(folder: Path, cameras: Cameras) -> None:
     np.savez(folder / "rig.npz", viewmats=cameras.viewmats, Ks=cameras.Ks, size=size)
 
 
-def run_pycolmap(task: str, folder: Path, timeout: float) -> None:
+def run_pycolmap(task: str, folder: Path, timeout: float, tell: Tell = silent) -> None:
     """Run one task of ``gsstream.input.seeds._pycolmap`` on a folder, in a process of its own.
 
     Raises InputError when pycolmap is not installed, and when the process fails or takes more than ``timeout`` seconds.
@@ -73,13 +76,27 @@ def run_pycolmap(task: str, folder: Path, timeout: float) -> None:
             "or give the recording a points_frame0.npz"
         )
     command = [sys.executable, "-m", "gsstream.input.seeds._pycolmap", task, str(folder)]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
-    except subprocess.TimeoutExpired as error:
+    with (folder / "log.txt").open("w") as log, subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=log, text=True
+    ) as process:  # fmt: skip
+        late = threading.Timer(timeout, process.kill)
+        late.start()
+        try:
+            for line in process.stdout or ():
+                if (sign := re.fullmatch(r"sign (\d+) (\d+) (.*)\n", line)) is not None:
+                    tell(sign[3], int(sign[1]), int(sign[2]))
+            code = process.wait()
+        except BaseException:
+            process.kill()
+            raise
+        finally:
+            in_time = late.is_alive()
+            late.cancel()
+    if not in_time:
         raise InputError(
             f"structure from motion did not finish within {timeout:g} s; shrink the images (scale) or give points"
-        ) from error
-    if done.returncode != 0:
-        how = f"was ended by signal {-done.returncode}" if done.returncode < 0 else f"exited with {done.returncode}"
-        tail = " | ".join(done.stderr.strip().splitlines()[-3:])
-        raise InputError(f"structure from motion: the pycolmap process {how}: {tail}")
+        )
+    if code != 0:
+        said = (folder / "log.txt").read_text(errors="replace").strip().splitlines()[-3:]
+        how = f"was ended by signal {-code}" if code < 0 else f"exited with {code}"
+        raise InputError(f"structure from motion: the pycolmap process {how}: {' | '.join(said)}")

@@ -6,8 +6,9 @@ disturbs, mean of the two best neighbours against occlusion, and semi-global agg
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +17,11 @@ import torch.nn.functional as F
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.shapes import FloatArray, check_shape
+from gsstream.core.signs import Tell, silent
 from gsstream.input.seeds.aggregate import aggregate, best_plane
 from gsstream.input.seeds.geometry import depth_range, neighbour_views, pixel_centers
 from gsstream.input.seeds.window import window_mean
+from gsstream.input.seeds.workers import one_thread_each
 
 _GREY = np.array([0.299, 0.587, 0.114], np.float32)
 
@@ -34,7 +37,7 @@ class SweepSettings:
         noise: image noise in [0, 1] below which texture does not count.
         unseen: cost of a hypothesis outside a neighbour's image; an uncorrelated match costs 0.5.
         step_penalty, jump_penalty: aggregation costs of a change by one plane and by more.
-        workers: threads, each on a view of its own.
+        workers: threads, each on a view of its own; 0: one for each processor that the process may use.
     """
 
     planes: int = 128
@@ -44,10 +47,12 @@ class SweepSettings:
     unseen: float = 0.6
     step_penalty: float = 0.03
     jump_penalty: float = 1.0
-    workers: int = 2
+    workers: int = 0
 
 
-def sweep_depths(images: FloatArray, cameras: Cameras, settings: SweepSettings) -> FloatArray:
+def sweep_depths(
+    images: FloatArray, cameras: Cameras, settings: SweepSettings, tell: Tell = silent
+) -> FloatArray:
     """Return the planar depth of every pixel of every view, right or wrong: nothing is rejected here.
 
     Returns [C, H, W] float32, scene units. Deterministic for any number of workers.
@@ -59,22 +64,27 @@ def sweep_depths(images: FloatArray, cameras: Cameras, settings: SweepSettings) 
     # Steps uniform in the root of inverse depth: finer for far walls than uniform parallax, coarser right at the lens.
     root = np.linspace(near_far[:, 1] ** -0.5, near_far[:, 0] ** -0.5, settings.planes, axis=1)
     inverse = (root**2).astype(np.float32)
+    stop = threading.Event()
 
     def one(view: int) -> FloatArray:
-        cost = _matching_cost(grey, cameras, view, partners[view].tolist(), inverse[view], settings)
+        cost = _matching_cost(grey, cameras, view, partners[view].tolist(), inverse[view], settings, stop)
         total = aggregate(cost, grey[view].numpy(), settings.step_penalty, settings.jump_penalty)
         plane = best_plane(total)
         depth: FloatArray = (root[view, 0] + plane * (root[view, 1] - root[view, 0])) ** -2.0
         return depth.astype(np.float32)
 
-    # Many small tensors: a second thread inside an operation costs more than it brings, one per view does not.
-    threads = torch.get_num_threads()
-    try:
-        with ThreadPoolExecutor(settings.workers, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            depths: FloatArray = np.stack(list(pool.map(one, range(len(cameras)))))
-            return depths
-    finally:
-        torch.set_num_threads(threads)
+    with one_thread_each(settings.workers) as pool:
+        views = [pool.submit(one, view) for view in range(len(cameras))]
+        try:
+            for done, view in enumerate(as_completed(views)):
+                view.result()
+                tell("looking for points: cameras swept", done + 1, len(views))
+        except BaseException:
+            stop.set()  # Ctrl-C does not wait for views that are begun
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+        depths: FloatArray = np.stack([view.result() for view in views])
+        return depths
 
 
 def agreement(images: FloatArray, cameras: Cameras, settings: SweepSettings, *, views: int, limit: float) -> float:
@@ -100,16 +110,19 @@ def agreement(images: FloatArray, cameras: Cameras, settings: SweepSettings, *, 
 
 
 def _matching_cost(
-    grey: torch.Tensor, cameras: Cameras, view: int, partners: list[int], inverse: FloatArray, settings: SweepSettings
-) -> FloatArray:
-    """[D, H, W] mean of the two best neighbours' (1 - NCC) / 2, in [0, 1]."""
+    grey: torch.Tensor, cameras: Cameras, view: int, partners: list[int], inverse: FloatArray, settings: SweepSettings,
+    stop: threading.Event | None = None,
+) -> FloatArray:  # fmt: skip
+    """[D, H, W] mean of the two best neighbours' (1 - NCC) / 2, in [0, 1]; half done where it was stopped."""
     height, width = grey.shape[1:]
     reference = grey[view][None, None]
     statistics = [_mean_and_variance(reference, half) for half in settings.windows]
     maps = [_plane_map(cameras, view, partner) for partner in partners]
-    cost = np.empty((len(inverse), height, width), np.float32)
+    cost = np.zeros((len(inverse), height, width), np.float32)
     chunk = 4  # planes at a time: the temporaries stay in the cache
     for start in range(0, len(inverse), chunk):
+        if stop is not None and stop.is_set():
+            break
         planes = torch.from_numpy(inverse[start : start + chunk])
         best = torch.full((len(planes), height, width), settings.unseen)
         second = best.clone()

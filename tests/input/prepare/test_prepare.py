@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import re
 import shlex
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +23,7 @@ from gsstream.input.recordings.open import open_source
 from tests.input.prepare.bad_scenes import save
 from tests.input.recordings.scenes import write_video
 
+MAIN = "from gsstream.cli.main import main; main()"
 needs_pycolmap = pytest.mark.skipif(importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed")
 #: Structure from motion needs neighbours that are not far apart, and pixels.
 LARGE = "synthetic:width=320&height=240&views=10&frames=1&static=true"
@@ -277,7 +282,8 @@ def test_photographs_become_a_picture_by_the_printed_commands_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    few = ["--scale", "0.25", "--frames", "1", "--no-video", "--set", "first_frame.max_iterations=20", "--out", "o"]
+    few = ["--scale", "0.25", "--frames", "1", "--no-video", "--out", "o"]
+    few += ["--set", "first_frame.max_iterations=20", "--set", "first_frame.points=recording"]
     assert run_command(["run", "--source", str(photographs(tmp_path / "fox")), *few]) == 2
     (made,) = re.findall(r"gsstream (scene prepare \S+ --out (\S+))$", capsys.readouterr().err.strip())
     assert run_command(made[0].split()) == 0
@@ -291,3 +297,38 @@ def test_photographs_become_a_picture_by_the_printed_commands_alone(
     assert run_command(["run", "--source", made[1], *few, "--overwrite", "--set", *shlex.split(setting)]) == 0
     assert " dB" in capsys.readouterr().err
     assert (tmp_path / "o" / "contact_sheet.png").stat().st_size > 1000
+
+
+@pytest.mark.sfm
+@needs_pycolmap
+def test_what_ends_a_preparation_leaves_no_temporary_files(tmp_path: Path) -> None:
+    raw, scratch = raw_pictures(tmp_path / "raw", 1), tmp_path / "scratch"
+    scratch.mkdir()
+    command = [sys.executable, "-c", MAIN, "scene", "prepare", str(raw), "--out", str(tmp_path / "scene")]
+    with subprocess.Popen(command, env={**os.environ, "TMPDIR": str(scratch)}, stderr=subprocess.PIPE) as process:
+        while not list(scratch.glob("gsstream-sfm-*/features.db")):
+            assert process.poll() is None, "it ended before it could be ended"
+            time.sleep(0.01)
+        process.terminate()
+        _, said = process.communicate(timeout=120)
+    assert (process.returncode, said) == (143, b"ended by SIGTERM\n")
+    assert list(scratch.iterdir()) == []
+
+
+@pytest.mark.sfm
+@needs_pycolmap
+def test_many_photographs_are_matched_with_those_that_were_taken_about_then() -> None:
+    """In a process of its own: it imports pycolmap."""
+    code = (
+        "from gsstream.input.seeds._features import pairs_by_place, pairs_in_order\n"
+        "import json, numpy as np\n"
+        "poses = np.tile(np.eye(4), (60, 1, 1)); poses[:, 0, 3] = -np.arange(60)\n"
+        "names = list(map(str, range(60)))\n"
+        "print(json.dumps([pairs_in_order(names), pairs_by_place(names, poses)]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    in_order, by_place = json.loads(done.stdout)
+    assert {min(abs(int(a) - int(b)), 60 - abs(int(a) - int(b))) for a, b in in_order} == {*range(1, 11), 16}
+    assert len(in_order) == 60 * 11 < 60 * 59 / 2
+    assert max(abs(int(a) - int(b)) for a, b in by_place) <= 20
+    assert {number for pair in by_place for number in pair} == set(map(str, range(60)))

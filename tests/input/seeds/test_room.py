@@ -25,6 +25,7 @@ from gsstream.input.seeds.room import (
     with_room,
 )
 from gsstream.input.seeds.seeding import photo_consistent_seeds
+from gsstream.input.seeds.workers import one_thread_each
 
 #: A little off what the cameras look at.
 TRUTH = Room(np.array([0.05, -0.04, 0.02]), 3.3, np.array([0.0, 0.0, 1.0]), -0.7)
@@ -109,9 +110,12 @@ def test_pictures_agree_on_the_true_surface_only() -> None:
     grey = torch.from_numpy(photograph(TRUTH, DOME).mean(-1))
     steps = np.linspace(-2, 2, 40)
     flat = np.stack(np.meshgrid(steps, steps, [0.0], indexing="ij"), -1)[:, :, 0]
-    scores = {height: surface_agreement(grey, DOME, flat + np.array([0, 0, height])) for height in (-1.1, -0.7, -0.3)}
+    with one_thread_each(2) as pool:
+        heights = (-1.1, -0.7, -0.3)
+        scores = {z: surface_agreement(grey, DOME, flat + np.array([0, 0, z]), pool) for z in heights}
+        black = surface_agreement(torch.zeros_like(grey), DOME, flat, pool)
     assert scores[-0.7] > 0.8 > 2 * max(scores[-1.1], scores[-0.3])
-    assert surface_agreement(torch.zeros_like(grey), DOME, flat) == 0, "black pictures agree on nothing"
+    assert black == 0, "black pictures agree on nothing"
 
 
 @pytest.fixture

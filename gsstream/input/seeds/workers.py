@@ -1,0 +1,27 @@
+"""Threads for many small tensors, on all processors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+
+import torch
+
+from gsstream.core.processors import processors
+
+
+@contextmanager
+def one_thread_each(workers: int = 0) -> Iterator[ThreadPoolExecutor]:
+    """Give a pool in which torch runs on one thread, and so outside of it: a second one inside a small operation costs
+    more than it brings. 0 workers: one for each processor.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(
+            workers or processors(), initializer=torch.set_num_threads, initargs=(1,)
+        ) as pool:
+            yield pool
+    finally:
+        torch.set_num_threads(threads)

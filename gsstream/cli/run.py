@@ -48,9 +48,8 @@ def run(
 ) -> None:
     """Encode a recording as a stream of 3D Gaussians.
 
-    The recipe is the method's, changed by --recipe FILE, then by --set and the short options. Ctrl-C (exit code 130)
-    and SIGTERM (143) end after the current frame with a valid stream, and at once before frame 0 is written; --resume
-    continues it to the same bytes.
+    The recipe is the method's, changed by --recipe FILE, then --set and the short options. Ctrl-C (exit code 130) and
+    SIGTERM (143) end after the current frame, before frame 0 is written at once; --resume goes on to the same bytes.
     """
     from gsstream.core.needs import require_encoder
     from gsstream.engine.run.output import claim_output, disk_errors, ended_by_signals
@@ -70,13 +69,11 @@ def run(
     # Read before the folder is touched: --overwrite must not delete a run for the sake of a faulty recording.
     first = None if first_frame is None else read_first_frame(stream_file(first_frame))
     wanted, quiet = shown.wanted(), shown.quiet
-    say = _silent if quiet else _note
-    if assembly.note:
-        say(assembly.note)
+    say, named = _silent if quiet else _note, bool(recipe.method or recipe.recipe)
     with working("opening the recording", quiet):
         recording = open_recording(source, assembly.recipe, catalog)
     try:
-        named = bool(recipe.method or recipe.recipe)
+        say(assembly.note)
         _reused_lines(say, resolved.recipe, recording.info, named=named, catalog=catalog)
         _first_look(recording, source, quiet, again=resume)
         with claim_output(out, resume=resume, overwrite=overwrite), ended_by_signals() as came, serving(server):
@@ -97,7 +94,9 @@ def run(
 
 
 def _note(line: str) -> None:
-    typer.echo(f"note: {line}", err=True)
+    """Print a note; nothing where there is nothing to say."""
+    if line:
+        typer.echo(f"note: {line}", err=True)
 
 
 def _silent(_: str) -> None:

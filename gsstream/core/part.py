@@ -45,12 +45,16 @@ class Part(ABC):  # noqa: B024 - each kind adds what is abstract
     ``source``: where the idea is from, for listings: a citation such as ``"S2GS, section 3.2"``, or the name of the
     distribution that had it first.
 
+    ``processor_only``: why the part cannot work with tensors of a GPU; empty where it can. A run with it renders on the
+    processor.
+
     ``denied``: checks of the contract kit that the part cannot pass -> why not, in 20 characters or more. They are made
     all the same and must fail: a denial that is no longer true is itself a failure.
     """
 
     Config: ClassVar[type[PartConfig]] = PartConfig
     source: ClassVar[str] = ""
+    processor_only: ClassVar[str] = ""
     traits: ClassVar[Traits] = Traits()
     denied: ClassVar[Mapping[str, str]] = MappingProxyType({})
     if TYPE_CHECKING:

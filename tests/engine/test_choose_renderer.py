@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from gsstream.core.errors import InputError, PluginUnavailable
+from gsstream.core.errors import InputError, PluginUnavailable, RecipeError
 from gsstream.core.part import PartConfig
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.assembly.choose_renderer import VARIABLE, choose_renderer
@@ -95,6 +95,16 @@ def test_a_gpu_that_cannot_be_used_is_named_with_the_reason(
     parts = assembled(with_gsplat(machine, renderer))
     assert parts.recipe.renderer.name == "cpu"
     assert re.match(says, parts.note), parts.note
+
+
+@pytest.mark.parametrize("method", ["queen", "quarc", "comgs-s", "stream3dgs"])
+def test_a_method_of_the_processor_stays_there_and_says_why(machine: pytest.MonkeyPatch, method: str) -> None:
+    catalog = with_gsplat(machine, OnGpu)
+    parts = assemble(resolve_recipe(method, catalog.recipe_path, (), ()), catalog)
+    assert parts.recipe.renderer.name == "cpu"
+    assert re.match(rf"{GPU} is not used: \w+ \w+: .*numpy", parts.note), parts.note
+    with pytest.raises(RecipeError, match=r"'gsplat' works on a GPU, and \w+ \w+: .*numpy; choose --renderer cpu"):
+        assemble(resolve_recipe(method, catalog.recipe_path, (), [("--set", "renderer=gsplat")]), catalog)
 
 
 def test_torch_without_cuda_is_named_where_a_driver_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

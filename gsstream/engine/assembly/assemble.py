@@ -127,7 +127,7 @@ def assemble(
         if slot in live:
             built: Part | None = live[slot]
         elif slot == "renderer" and ref.name == "auto":
-            chosen = _choose(ref, resolved, catalog, problems)
+            chosen = _choose(ref, resolved, catalog, problems, parts)
             ref = ComponentRef(name=chosen.name) if chosen else ref
             built, note = (chosen.renderer, chosen.note) if chosen else (None, "")
         else:
@@ -137,6 +137,8 @@ def assemble(
             refs[slot] = ComponentRef(name=ref.name, params=built.config.model_dump(mode="json"))
     compiled = "renderer" not in parts or parts["renderer"].device.type == "cpu"
     loss = _loss(resolved, catalog, problems, compiled)
+    if not compiled and (reason := _processor_only(parts)):
+        problems.append(f"renderer {refs['renderer'].name!r} works on a GPU, and {reason}; choose --renderer cpu")
     if "streaming_method" in parts:
         paths = list(unused_keys(resolved.recipe.model_copy(update=refs), parts["streaming_method"], parts))
         problems += _unused_key_messages(paths, resolved)
@@ -220,9 +222,17 @@ def _optimiser(catalog: Catalog, compiled: bool) -> Part:
     return construct("optimiser", REFERENCE, cls, cls.Config(), catalog)
 
 
-def _choose(ref: ComponentRef, resolved: ResolvedRecipe, catalog: Catalog, problems: list[str]) -> Chosen | None:
+def _processor_only(parts: Mapping[str, Part]) -> str:
+    """Which of these parts cannot work with tensors of a GPU, and why; empty where all can."""
+    found = (f"{slot} {type(part).__name__}: {part.processor_only}" for slot, part in parts.items())
+    return next((text for text in found if not text.endswith(": ")), "")
+
+
+def _choose(
+    ref: ComponentRef, resolved: ResolvedRecipe, catalog: Catalog, problems: list[str], parts: Mapping[str, Part]
+) -> Chosen | None:
     if ref.params:
         where = resolved.near(("renderer", "params", next(iter(ref.params)))).where
         problems.append(f"{where}: renderer.params needs a named renderer, but renderer.name is 'auto'")
         return None
-    return choose_renderer(catalog)
+    return choose_renderer(catalog, _processor_only(parts))

@@ -43,8 +43,11 @@ def requested_device(environment: Mapping[str, str] = os.environ) -> str:
     return text
 
 
-def choose_renderer(catalog: Catalog) -> Chosen:
+def choose_renderer(catalog: Catalog, processor_only: str = "") -> Chosen:
     """Return the fastest renderer that works here.
+
+    Arguments:
+        processor_only: why the parts of the run cannot work with tensors of a GPU; empty where they can.
 
     Raises:
         InputError: GSSTREAM_DEVICE has a value that it cannot have.
@@ -52,7 +55,7 @@ def choose_renderer(catalog: Catalog) -> Chosen:
     """
     device, note = requested_device(), ""
     if device != "cpu":
-        found = _on_gpu(catalog, device)
+        found = _on_gpu(catalog, device, processor_only)
         if isinstance(found, Chosen):
             return found
         if device != "auto":
@@ -72,7 +75,7 @@ def choose_renderer(catalog: Catalog) -> Chosen:
     return Chosen("reference", construct("renderer", "reference", cls, cls.Config(), catalog), note)
 
 
-def _on_gpu(catalog: Catalog, device: str) -> Chosen | str:
+def _on_gpu(catalog: Catalog, device: str, processor_only: str) -> Chosen | str:
     """The renderer on the GPU, or why it is not used; empty where there is no GPU."""
     if not torch.cuda.is_available():
         if not (Path("/proc/driver/nvidia/version").is_file() or shutil.which("nvidia-smi")):
@@ -80,6 +83,8 @@ def _on_gpu(catalog: Catalog, device: str) -> Chosen | str:
         build = f"for CUDA {torch.version.cuda}" if torch.version.cuda else "for the processor only"
         return f"the NVIDIA GPU is not used: torch {torch.__version__} is built {build}; {install_extra('gpu')}"
     gpu = torch.cuda.get_device_name(None if device == "auto" else device)
+    if processor_only:
+        return f"{gpu} is not used: {processor_only}"
     reasons = []
     for name in GPU_RENDERERS:
         try:

@@ -57,8 +57,8 @@ def between(marks: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
     return [tuple(b - a for a, b in zip(one, other, strict=True)) for one, other in pairwise(marks)]
 
 
-def packets_of_the_processor(frames: list[Frame]) -> list[bytes]:
-    method = method_on(CPU)
+def packets_of(frames: list[Frame], device: torch.device = CPU, name: str = "s2gs-fast") -> list[bytes]:
+    method = method_on(device, name)
     step = method.begin(frames[0])
     found = [step.packet.data]
     for frame in frames[1:]:
@@ -103,8 +103,15 @@ def test_a_later_frame_and_its_motion_stay_there_and_packets_are_those_of_the_pr
             assert between(motion)[-1][:3] == RESIDENT, (log.up, log.down, log.waits)
             assert all(map(int.__le__, crossed, FRAME)), (crossed, log.up, log.down, log.waits)
             packets.append(step.packet.data)
-    assert packets == packets_of_the_processor(frames)
+    assert packets == packets_of(frames)
     assert len(set(packets)) == len(frames)
+
+
+@pytest.mark.parametrize("name", ["s2gs-paper", "dense", "hicom"])
+def test_other_methods_write_the_packets_of_the_processor(frames: list[Frame], name: str) -> None:
+    with PretendDevice():
+        found = packets_of(frames[:2], DEVICE, name)
+    assert found == packets_of(frames[:2], CPU, name)
 
 
 def with_intruder(monkeypatch: pytest.MonkeyPatch, intruder: Callable[[torch.Tensor], torch.Tensor]) -> None:
@@ -159,4 +166,4 @@ def test_where_little_changes_the_scene_stays_there_and_only_what_changed_crosse
         scene = step.state.resident.gaussians.map(torch.Tensor.cpu)
     for (name, value), (_, want) in zip(scene.items(), step.state.player.gaussians.items(), strict=True):
         assert torch.equal(value, torch.from_numpy(want)), name
-    assert packets == packets_of_the_processor(few)
+    assert packets == packets_of(few)

@@ -41,6 +41,7 @@ class KeyPointMotion(MotionPart):
     """
 
     source = "ComGS (NeurIPS 2025)"
+    processor_only = "it moves rows by numpy"
 
     class Config(PartConfig):
         keypoints: int = Field(default=200, ge=1, le=10_000, description="key points in a frame at most")

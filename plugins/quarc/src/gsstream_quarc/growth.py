@@ -21,6 +21,7 @@ class ChangeGatedCopies(Growth):
     """
 
     source = "QuARC-GS (arXiv 2608.18285)"
+    processor_only = "it chooses places by numpy"
 
     class Config(CopySettings):
         views: int = Field(default=4, ge=1, description="training cameras, spread over the rig, whose change counts")

@@ -52,6 +52,7 @@ class Queen(StreamingMethod[QueenState]):
     """
 
     source = "QUEEN (Girish et al. 2024)"
+    processor_only = "its masks and rows are made by numpy"
 
     Config = QueenConfig
     recipe_keys = ("stream.epochs",)

@@ -38,6 +38,7 @@ class CacheMotion(MotionPart):
     """
 
     source = "3DGStream (Sun et al. 2024)"
+    processor_only = "its hash grid is looked up by numpy"
 
     class Config(PartConfig):
         epochs: int = Setting(default=8, ge=1, le=1000, description="passes over the training cameras")

@@ -303,7 +303,6 @@ def test_what_has_been_handed_out_is_not_changed_afterwards(wrong, message: str)
     assert (caught.value.slot, caught.value.part, caught.value.frame) == ("streaming_method", "Wrong", 1)
 
 
-
 def test_what_fails_after_a_packet_leaves_the_encoder_as_it_was_and_gives_the_packet_again() -> None:
     sent, broken = [], [True]
 
@@ -379,23 +378,6 @@ def test_the_contract_kit_finds_what_a_resumed_run_forgets_of_that_work() -> Non
     check_method_resume(MethodUnderTest("dense", Remembers(Follow.Config(step=1e-4))))
     with pytest.raises(AssertionError, match="resumed run: packet of frame 2 differs"):
         check_method_resume(MethodUnderTest("dense", Tires(Follow.Config(step=1e-4))))
-
-
-def test_a_run_repeats_failed_frames_of_a_whole_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    hold = Hold.step
-
-    def fails(self, state, frame, tools):
-        if frame.index == 2 and frame.epoch_scale > 0:
-            raise RuntimeError("out of ideas")
-        return hold(self, state, frame, tools)
-
-    monkeypatch.setattr(Hold, "step", fails)
-    assert run_command([*RUN, "--out", str(tmp_path / "raise")]) == 1
-    assert run_command([*RUN, "--set", "stream.on_error=repeat", "--out", str(tmp_path / "repeat")]) == 0
-    lines = (tmp_path / "repeat" / "metrics.jsonl").read_text().splitlines()
-    assert ['"error"' in line for line in lines] == [False, False, True, False]
-    with Playback(tmp_path / "repeat" / "stream.gss") as playing:
-        assert list(playing.frames) == [0, 1, 2, 3]
 
 
 def refusal(*sets: str, method: str = "hold") -> list[str]:

@@ -119,16 +119,6 @@ def test_bad_cameras(change: dict[str, object], message: str) -> None:
         NumpyRasterizer(**{**good, **change})  # type: ignore[arg-type]
 
 
-def test_backward_needs_a_forward() -> None:
-    with pytest.raises(InputError, match="backward: expected a forward pass before"):
-        rasterizer().backward(upstream(0)[0])
-    subject = rasterizer()
-    subject.forward(random_splats(5, 0, 1))
-    subject.forget()
-    with pytest.raises(InputError, match="backward: expected a forward pass before"):
-        subject.backward(upstream(0)[0])
-
-
 def test_two_threads_on_one_object_are_refused() -> None:
     width, height = 640, 480
     splats = random_splats(20_000, 0, 1)

@@ -40,6 +40,7 @@ ANY = {"forward", "forget", "free_scratch"}
 CACHED = ANY | {"freeze", "update", "backward_cached", "contributing_in_cache", "forward_cached"}
 #: State: the calls that lead to it, and those it takes.
 STATES = {
+    "forgotten": (["forward", "forget"], CACHED),
     "cached": (["forward", "forward_cached"], CACHED),
     "cached by an update": (["forward", "freeze", "forward_active", "update"], CACHED),
     "cached, scratch shed": (["forward", "freeze", "free_scratch"], CACHED),
@@ -71,6 +72,12 @@ def test_a_state_takes_these_calls_and_no_others(state: str, call: str) -> None:
     # A refusal changes nothing: what the state takes it still takes.
     for other in sorted(taken - {"forward", "update", "freeze", "forget", "free_scratch", "forward_cached"}):
         CALLS[other](subject)
+
+
+@pytest.mark.parametrize("call", ["backward", "freeze", "forward_active", "backward_active", "contributing_in_cache"])
+def test_a_new_rasteriser_takes_none_that_needs_a_pass(call: str) -> None:
+    with pytest.raises(InputError, match=f"{call}: {MESSAGES.get(call, FORWARD)}"):
+        CALLS[call](rasterizer())
 
 
 def test_a_pass_that_fails_leaves_the_state_before_it() -> None:

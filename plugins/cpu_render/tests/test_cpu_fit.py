@@ -110,25 +110,6 @@ def test_weights_of_tiles_are_those_of_the_default_body_with_a_mask(coloured: bo
     assert_near(fused(*opened(), wanted), default(*opened(), wanted), 2e-6)
 
 
-def test_the_gradients_of_two_halves_of_the_tiles_add_up_to_that_of_all() -> None:
-    """Without SSIM, whose windows look beyond a tile, every pixel speaks for itself."""
-    wanted, half = replace(comparison(), dssim=0.0), (some_tiles() > 0).float()
-    results = []
-    for tiles in (None, half, 1 - half):
-        session, rows = opened()
-        results.append(fused(session, rows, replace(wanted, tile_weights=tiles)))
-    for (name, whole), (_, one), (_, other) in zip(*(found.grad.items() for found in results), strict=True):
-        np.testing.assert_allclose((one + other).numpy(), whole.numpy(), rtol=0, atol=1e-5 * float(whole.abs().max()),
-                                   err_msg=name)  # fmt: skip
-
-
-def test_without_any_tile_loss_and_gradient_are_zero() -> None:
-    session, rows = opened()
-    nothing = fused(session, rows, replace(comparison(), tile_weights=torch.zeros_like(some_tiles())))
-    assert nothing.loss == 0
-    assert all(not bool(value.any()) for _, value in nothing.grad.items())
-
-
 def test_it_refuses_weights_of_another_shape() -> None:
     session, rows = opened()
     with pytest.raises(InputError, match="tile_weights"):

@@ -32,6 +32,7 @@ METHODS = ["dense", "s2gs-edge"]
 
 
 def same_bits(ours, theirs) -> None:
+    """Bits, because every packet is a difference to this state: what is a rounding here adds up over the frames."""
     for (name, a), (_, b) in zip(ours.items(), theirs.items(), strict=True):
         assert a.dtype == b.dtype == np.float32, name
         assert a.shape == b.shape, name

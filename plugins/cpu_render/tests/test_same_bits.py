@@ -1,4 +1,8 @@
-"""Any number of threads gives the same bits: one table of calls, each of which has work for several threads."""
+"""Any number of threads gives the same bits: one table of calls, each of which has work for several threads.
+
+Bits, because what was trained becomes symbols: a rounding moves one over its border, and then a run that is resumed on
+another number of threads writes another stream.
+"""
 
 from __future__ import annotations
 

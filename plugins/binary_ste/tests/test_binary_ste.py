@@ -1,24 +1,13 @@
-"""Binary gates: the law of the draws, the gradient, and the collapse that the released clamp causes."""
+"""Binary gates: what they are, the gradient, and the collapse that the released clamp causes."""
 
 from __future__ import annotations
 
-import pytest
 import torch
 from gsstream_binary_ste.binary import BinarySteGate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 Config = BinarySteGate.Config
-
-
-@pytest.mark.parametrize("temperature", [0.05, 0.3, 5.0])
-def test_the_temperature_does_not_change_how_often_a_gate_opens(temperature: float) -> None:
-    part = BinarySteGate(Config(temperature=temperature))
-    for p in (0.1, 0.5, 0.9):
-        logits = part.init(torch.logit(torch.tensor(p)).expand(20_000).clone())
-        noise = part.noise(20_000, torch.Generator().manual_seed(1))
-        share = float(part.sample(logits, noise).mean())
-        assert abs(share - p) < 4 * (p * (1 - p) / 20_000) ** 0.5
 
 
 @settings(max_examples=100, deadline=None)
@@ -62,9 +51,3 @@ def test_the_released_clamp_closes_gates_that_are_needed() -> None:
     kept, needless = open_after_training(BinarySteGate())
     assert kept >= 38
     assert needless == 0
-
-
-def test_without_noise_there_is_no_noise() -> None:
-    part = BinarySteGate(Config(noise="none"))
-    assert part.noise(5, torch.Generator()) is None
-    assert part.claims().stochastic is False

@@ -23,10 +23,11 @@ C1, C2 = 0.01**2, 0.03**2
 
 
 class PreparedTarget(NamedTuple):
-    """An image as planes [3, 1, H, W], and mean and variance of its windows, of the same shape."""
+    """An image as planes [3, 1, H, W], and of its windows, of the same shape: mean, mean^2 + C1, variance + C2."""
 
     planes: torch.Tensor
     mean: torch.Tensor
+    energy: torch.Tensor
     variance: torch.Tensor
 
 
@@ -39,7 +40,8 @@ class ReferenceLoss(Loss):
     def prepare(self, target: torch.Tensor) -> Any:
         planes = target.permute(2, 0, 1)[:, None].contiguous()
         mean, square = _windowed(torch.cat([planes, planes * planes])).chunk(2)
-        return PreparedTarget(planes, mean, square - mean * mean)
+        energy = mean * mean
+        return PreparedTarget(planes, mean, energy + C1, square - energy + C2)
 
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
@@ -56,11 +58,11 @@ class ReferenceLoss(Loss):
         by_mean, by_square, by_product = _windowed(grads).chunk(3)
         by_ssim = torch.addcmul(by_mean, planes, by_square, value=2).addcmul_(prepared.planes, by_product)
         sign = difference.sign_() if weight is None else difference.sign_() * weight
-        gradient = sign.mul_(1 - dssim).sub_(by_ssim, alpha=dssim).mul_(1 / image.numel())
+        gradient = sign.mul_((1 - dssim) / image.numel()).sub_(by_ssim, alpha=dssim / image.numel())
         value = each.mean()
         # Else a pixel is NaN, or the image is so large that its square overflows.
         message = "image: expected finite values of ordinary size, got a loss that is not finite"
-        require(value.isfinite(), lambda: ShapeError(message))
+        require(value - value == 0, lambda: ShapeError(message))
         if tile_mask is not None:
             gradient = gradient * _pixel_weight(image, tile_mask)
         return value.double(), gradient[:, 0].permute(1, 2, 0).contiguous()
@@ -74,16 +76,16 @@ def ssim_and_grads(planes: torch.Tensor, target: PreparedTarget) -> tuple[torch.
     """
     mean, square, product = _windowed(torch.cat([planes, planes * planes, planes * target.planes])).chunk(3)
     both, energy = mean * target.mean, mean * mean
-    luminance, contrast = 2 * both + C1, 2 * (product - both) + C2
-    means = torch.addcmul(energy, target.mean, target.mean).add_(C1)
-    variances = (square - energy).add_(target.variance).add_(C2)
+    luminance = 2 * both + C1
+    contrast = 2 * (product - both) + C2
+    means, variances = energy + target.energy, square - energy + target.variance
     by_product = luminance / (means * variances)
     similar = by_product * contrast
     by_square = similar / variances
     # A higher mean makes both luminances and covariance change, and both energies: one by each way.
-    ways = target.mean * (contrast / luminance - 1) * by_product
-    by_mean = 2 * torch.addcmul(ways, mean, by_square - similar / means)
-    return similar, by_mean, by_square.neg_(), by_product.mul_(2)
+    ways = target.mean * (similar / luminance - by_product)
+    by_mean = torch.addcmul(ways, mean, by_square - similar / means)
+    return similar, by_mean.mul_(2), by_square.neg_(), by_product.mul_(2)
 
 
 def _windowed(planes: torch.Tensor) -> torch.Tensor:

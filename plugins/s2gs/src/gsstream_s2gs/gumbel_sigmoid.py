@@ -90,14 +90,14 @@ class GumbelSigmoid(GateSampler):
     def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
         """Gates [M] in {0, 1/levels, ..., 1}, dtype of the logits."""
         alpha = logits if noise is None else logits + noise.detach().to(logits.dtype)
-        soft = torch.sigmoid(alpha.detach() / self.config.temperature)
+        x = alpha.detach() / self.config.temperature
+        soft = torch.sigmoid(x)
         # Divided by a tensor, not by a number: some devices turn the latter into a product with 1/levels, which is not
         # the value the decoder computes.
         steps = soft.new_full((), float(self.num_levels))
         hard = torch.round(soft * steps) / steps
         # alpha - alpha is exactly 0, so the value is exactly the level; soft + (hard - soft) would be an ulp off.
-        tau = self.config.temperature
-        through = (alpha - alpha.detach()) * (sigmoid_derivative(alpha.detach() / tau) / tau)
+        through = (alpha - alpha.detach()) * (sigmoid_derivative(x, soft) / self.config.temperature)
         if self.config.clamp_gradient:
             through = through * ((hard > 0) & (hard < 1))
         return hard + through
@@ -127,9 +127,11 @@ class GumbelSigmoid(GateSampler):
         return logits.clamp(-self.config.logit_bound, self.config.logit_bound)
 
 
-def sigmoid_derivative(x: torch.Tensor) -> torch.Tensor:
-    """Derivative of the sigmoid; equally accurate at both ends, while s (1 - s) loses all digits at the upper one."""
-    return torch.sigmoid(x) * torch.sigmoid(-x)
+
+def sigmoid_derivative(x: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
+    """Derivative of the sigmoid, given its value at x; equally accurate at both ends, where s (1 - s) loses all digits.
+    """
+    return value * torch.sigmoid(-x)
 
 
 def logistic(uniform: torch.Tensor) -> torch.Tensor:

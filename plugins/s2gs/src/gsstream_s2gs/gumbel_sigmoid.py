@@ -127,7 +127,6 @@ class GumbelSigmoid(GateSampler):
         return logits.clamp(-self.config.logit_bound, self.config.logit_bound)
 
 
-
 def sigmoid_derivative(x: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
     """Derivative of the sigmoid, given its value at x; equally accurate at both ends, where s (1 - s) loses all digits.
     """

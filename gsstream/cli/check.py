@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from gsstream.plugins.catalog import Catalog
     from gsstream.testing.kit import CheckResult
 
-MARKS = {"passed": "✓", "failed": "✗", "expected failure": "⚠", "skipped": "⚠"}
+MARKS = {"passed": "✓", "failed": "✗", "warning": "⚠", "expected failure": "⚠", "skipped": "⚠"}
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,8 @@ def check(
     subjects = []
     for subject in _subjects(load_catalog(), name, source, settings or []):
         typer.echo(subject.heading)
-        # When all have the same reason, it is printed once.
-        for result in subject.results[:1] if subject.absent else subject.results:
-            if not (quiet and result.status == "passed"):
-                typer.echo(_line(result, "every check" if subject.absent else result.check))
+        for line in _lines(subject, quiet):
+            typer.echo(line)
         typer.echo(f"  {summary(subject.results)}")
         subjects.append(subject)
     everything = [result for subject in subjects for result in subject.results]
@@ -58,6 +56,26 @@ def check(
     idle = all(result.status == "skipped" for result in everything) and not all(subject.absent for subject in subjects)
     if idle or not all(result.ok for result in everything):
         raise typer.Exit(1)
+
+
+def _lines(subject: Subject, quiet: bool) -> Iterator[str]:
+    """One line for each check, and one for all that have the same reason; what passed or was not claimed not if quiet.
+    """
+    if subject.absent:
+        yield _line(subject.results[0], "every check")
+        return
+    told = set()
+    for result in subject.results:
+        reason = (result.status, result.message)
+        if reason in told or (quiet and result.status in ("passed", "skipped")):
+            continue
+        same = [each for each in subject.results if (each.status, each.message) == reason]
+        if result.status == "failed" and len(same) > 1:
+            told.add(reason)
+            names = [each.check.removeprefix("check_") for each in same]
+            yield _line(result, f"{len(same)} checks ({', '.join(names)})")
+        else:
+            yield _line(result, result.check)
 
 
 def _line(result: CheckResult, what: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -16,9 +17,9 @@ from gsstream.testing import method_driver
 from gsstream.testing.command.checks import CommandUnderTest
 from gsstream.testing.packet.checks import PacketCodec
 from gsstream.testing.recording import SourceUnderTest
-from gsstream.testing.registry import CHECKS, MIN_REASON, Check, Skip, checks_for, expected_failure_of, kind_of
+from gsstream.testing.registry import CHECKS, MIN_REASON, Advice, Check, Skip, checks_for, expected_failure_of, kind_of
 
-Status = Literal["passed", "failed", "expected failure", "skipped"]
+Status = Literal["passed", "failed", "warning", "expected failure", "skipped"]
 #: Rooms of checks: for parts of all kinds, for each kind, for packets. Importing them fills the registry, in the order
 #: of the reports.
 ROOMS = ("common", *PART_KINDS, "packet", "command")
@@ -28,7 +29,7 @@ for _room in ROOMS:
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """Outcome of one check on one part. ``message``: numbers of the failure, or the reason of the skip."""
+    """Outcome of one check on one part. ``message``: numbers of the failure, the advice, or the reason of the skip."""
 
     check: str
     part: str
@@ -59,6 +60,8 @@ def run_check(entry: Check, subject: Any, expected: str | None = None) -> CheckR
         entry.function(subject)
     except Skip as reason:
         return CheckResult(entry.name, name, "skipped", str(reason))
+    except Advice as advice:
+        return CheckResult(entry.name, name, "warning", str(advice))
     except AssertionError as error:
         status: Status = "failed" if expected is None else "expected failure"
         return CheckResult(entry.name, name, status, str(error) if expected is None else f"{expected} ({error})")
@@ -185,6 +188,8 @@ def _as_test(entry: Check, part: Part | SourceUnderTest, expected: str | None) -
         pytest.skip(result.message)
     if result.status == "expected failure":
         pytest.xfail(result.message)
+    if result.status == "warning":
+        warnings.warn(result.message, stacklevel=2)
     assert result.ok, f"{entry.name} on {result.part}: {result.message}"
 
 
@@ -205,7 +210,7 @@ def all_checks() -> list[Check]:
 
 def summary(results: Sequence[CheckResult]) -> str:
     """Return "12 passed, 1 failed, 3 skipped": every status that occurs is counted."""
-    order: tuple[Status, ...] = ("passed", "failed", "expected failure", "skipped")
+    order: tuple[Status, ...] = ("passed", "failed", "warning", "expected failure", "skipped")
     counts = {status: sum(result.status == status for result in results) for status in order}
     return ", ".join(f"{number} {status}" for status, number in counts.items() if number)
 

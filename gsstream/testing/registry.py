@@ -20,6 +20,10 @@ MIN_REASON = 20
 CheckFunction = TypeVar("CheckFunction", bound=Callable[..., None])
 
 
+class Advice(Exception):
+    """What a part should have and works without: a warning, not a failure."""
+
+
 @dataclass(frozen=True, slots=True)
 class Check:
     """One property.

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from gsstream.cli.check import Subject, _lines
 from gsstream.cli.main import run_command
+from gsstream.testing.kit import CheckResult
 
 BROKEN = '''
 from typing import final
@@ -44,7 +46,7 @@ def test_a_sound_part(capsys: pytest.CaptureFixture[str]) -> None:
     assert out.startswith("propagation group-max (from gsstream ")
     assert "  ✓ propagation_monotone\n" in out
     assert "  ⚠ propagation_parent_bound (skipped): not claimed: PropagationTraits.parent_bound\n" in out
-    assert "21 passed, 1 skipped" in out.splitlines()[-1]
+    assert "22 passed, 1 skipped" in out.splitlines()[-1]
 
 
 def test_kind_and_name_choose_one_of_several(capsys: pytest.CaptureFixture[str]) -> None:
@@ -93,3 +95,10 @@ def test_settings_of_the_part_that_is_checked(capsys: pytest.CaptureFixture[str]
     assert "logits" in capsys.readouterr().err
     assert run_command(["check", "reference", "--set", "x=1"]) == 2
     assert "--set gives settings to one part" in capsys.readouterr().err
+
+
+def test_one_cause_is_told_once(capsys: pytest.CaptureFixture[str]) -> None:
+    results = [CheckResult(f"check_{name}", "part", "failed", f"raised {name[:1]}") for name in ("a1", "b", "a2")]
+    results.append(CheckResult("check_c", "part", "warning", "no source"))
+    lines = list(_lines(Subject("part", results), quiet=True))
+    assert lines == ["  ✗ 2 checks (a1, a2): raised a", "  ✗ b: raised b", "  ⚠ c (warning): no source"]

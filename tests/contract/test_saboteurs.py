@@ -21,7 +21,7 @@ from gsstream.testing.method_driver import MethodUnderTest
 
 
 def failed(results: list[CheckResult]) -> dict[str, str]:
-    return {result.check: result.message for result in results if not result.ok}
+    return {result.check: result.message for result in results if result.status in ("failed", "warning")}
 
 
 def test_every_check_has_a_saboteur_and_every_saboteur_a_check() -> None:
@@ -35,6 +35,7 @@ def test_fails_exactly_its_check(check: str) -> None:
     results = run_checks(SABOTEURS[check]())
     found = failed(results)
     assert set(found) == {check}
+    assert all(result.ok for result in results) == (check == "check_citation"), "house style is a warning"
     # A part that raises is caught by whatever check calls it first; a property is missed with numbers or names.
     assert len(found[check]) > 20
     if check == "check_rejects_nonfinite":

@@ -6,6 +6,7 @@ import ast
 import dataclasses
 import importlib
 import inspect
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -43,8 +44,18 @@ def api() -> str:
     for name in sorted(everything, key=str.lower):
         value = everything[name]
         if inspect.isclass(value) or inspect.isroutine(value):
-            lines += [f"### {name}", "", "```python", *_declared(name, value), "```", ""]
+            lines += [f"### {name}", "", "```python", *_declared(name, value), "```", "", *_meanings(value)]
     return "\n".join(lines)
+
+
+def _meanings(value: Any) -> list[str]:
+    """The section ``Arguments`` of a docstring as a list: what each field or argument means."""
+    section = re.search(r"^Arguments:\n(.*?)(?=^\S|\Z)", inspect.getdoc(value) or "", re.MULTILINE | re.DOTALL)
+    if section is None:
+        return []
+    entries = re.split(r"\n(?=\S)", inspect.cleandoc(section[1]))
+    named = [re.fullmatch(r"([\w, *]+): (.*)", " ".join(entry.split())) for entry in entries]
+    return [*(f"- `{found[1]}`: {found[2]}" for found in named if found is not None), ""]
 
 
 def _row(name: str, value: Any) -> str:

@@ -132,7 +132,9 @@ def _map(
         return reconstruct(images, model=options.model, shared=shared, held=held, tell=tell)
     training = [i for i in range(len(cameras)) if i not in held]
     size = _smallest([cameras[i] for i in training])
-    flat = [_flat(images[i], cameras[i].size, known.lenses[i], size) for i in training]
+    tell("undistorting frame 0", 0, 0)
+    made: dict[tuple[Lens, tuple[int, int]], Undistortion] = {}
+    flat = [_flat(images[i], cameras[i].size, known.lenses[i], size, made) for i in training]
     rig = Cameras(
         tuple(cameras[i].name for i in training), known.viewmats[training], np.stack([K for K, _ in flat]), *size
     )
@@ -144,13 +146,15 @@ def _map(
 
 
 def _flat(
-    image: FloatArray, size: tuple[int, int], lens: Lens, target: tuple[int, int]
-) -> tuple[FloatArray, FloatArray]:
-    """(K, picture) of a pinhole camera of the target size."""
+    image: FloatArray, size: tuple[int, int], lens: Lens, target: tuple[int, int],
+    made: dict[tuple[Lens, tuple[int, int]], Undistortion],
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """(K, picture) of a pinhole camera of the target size; ``made`` keeps what equal lenses share."""
     if not lens.distorts and size == target:
         return lens.K, image
-    made = undistortion(lens, size, target)
-    return made.K, made.apply(image)
+    if (lens, size) not in made:
+        made[lens, size] = undistortion(lens, size, target)
+    return made[lens, size].K, made[lens, size].apply(image)
 
 
 def _smallest(cameras: list[RawCamera]) -> tuple[int, int]:

@@ -27,7 +27,7 @@ from gsstream.testing.common import device as device
 from gsstream.testing.compare import ROUNDING, all_equal, finite
 from gsstream.testing.drive import Poison, behaviour_of, draw, outputs
 from gsstream.testing.recording import SourceUnderTest
-from gsstream.testing.registry import BEHAVED, MIN_REASON, Skip, check, checks_for, kind_of
+from gsstream.testing.registry import BEHAVED, MIN_REASON, Advice, Skip, check, checks_for, kind_of
 
 ALL = tuple(CONTRACTS)
 
@@ -88,12 +88,13 @@ def check_docstring(part: Part) -> None:
 
 @check("common", kinds=ALL)
 def check_citation(part: Part) -> None:
-    """The class attribute ``source`` says where the idea is from: a citation, or who had it first."""
+    """The class attribute ``source`` says where the idea is from: a citation, or who had it first; else a warning."""
     cited = type(part).source
-    assert isinstance(cited, str) and cited.strip(), (
-        f"{type(part).__name__}.source: expected a citation, e.g. 'S2GS, section 3.2', or the name of your "
-        f"distribution; got {cited!r}"
-    )
+    if not (isinstance(cited, str) and cited.strip()):
+        raise Advice(
+            f"{type(part).__name__}.source: a citation, e.g. 'S2GS, section 3.2', or the name of your distribution "
+            f"would tell where the idea is from; got {cited!r}"
+        )
 
 
 @check("common", kinds=ALL)

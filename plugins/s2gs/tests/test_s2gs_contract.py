@@ -21,6 +21,7 @@ RELEASED = Gradient(loss="l2norm", aggregate="sum-of-norms", normalisation="rati
 PARTS = [
     StreamingOctree(), StreamingOctree(Octree(gate_level=2)), StreamingOctree(Octree(grouping="gaussian")),
     ViewSpaceGradient(), ViewSpaceGradient(RELEASED), ViewSpaceGradient(Gradient(normalisation="minmax")),
+    ViewSpaceGradient(Gradient(normalisation="noise")),
     ViewSpaceGradient(Gradient(epsilon_mode="relative")), HierarchicalMax(),
     GumbelSigmoid(), GumbelSigmoid(Gate(levels=1)), GumbelSigmoid(Gate(noise="none")),
     GumbelSigmoid(Gate(levels=1, clamp_gradient=True)), GumbelSigmoid(Gate(levels=1, noise="gumbel")),

@@ -196,7 +196,9 @@ class ViewSpaceGradient(ConfidenceEstimator):
     def _noise_upstream(self, context: FrameContext, view: int) -> torch.Tensor:
         """The upstream gradient that the camera's noise alone could have given: one seeded draw."""
         before = context.previous_image(view)
-        generator = Rng(self.config.seed).stream(f"s2gs/view-gradient/noise/{view}", context.index)
+        # By the name of the camera: its noise is the same in whatever order cameras are asked.
+        name = context.cameras.ids[view]
+        generator = Rng(self.config.seed).stream(f"s2gs/view-gradient/noise/{name}", context.index)
         draw = torch.randn(before.shape, generator=generator, dtype=before.dtype).to(before.device)
         sigma: float = max(context.noise_sigma(view), self.config.noise_minimum)
         return 2 * sigma * draw / before.numel()

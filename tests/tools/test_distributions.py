@@ -11,8 +11,10 @@ from typing import Any
 
 import pytest
 from packaging.requirements import Requirement
+from ruamel.yaml import YAML
 
 import gsstream
+from gsstream.core.needs import ON_INDEX
 from tools.dist import PINS, ROOT, SUMS, build, projects
 
 PROJECTS = projects()
@@ -79,3 +81,25 @@ def test_built_in_another_folder_at_another_time_it_has_the_same_bytes(
         assert any(name.endswith("/tests/test_ft_pruning.py") for name in archive.getnames())
     with pytest.raises(FileExistsError, match="not empty"):
         build(tmp_path / "a", [project], isolated=False)
+
+
+def test_the_workflow_is_what_make_does() -> None:
+    workflow = YAML(typ="safe").load(ROOT / ".github" / "workflows" / "make.yaml")
+    targets = re.findall(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)[0].split()
+    steps = [step for job in workflow["jobs"].values() for step in job["steps"]]
+    commands = [step["run"] for step in steps if "run" in step]
+    assert commands == ["make test", "make dist"]
+    assert {command.removeprefix("make ") for command in commands} <= set(targets)
+    assert all(set(step) <= {"uses", "with"} for step in steps if "run" not in step)
+    assert set(workflow["jobs"]["release"]["needs"]) == {"test", "build"}, "nothing is published that was not tested"
+
+
+def test_pages_name_extras_that_exist_and_where_they_come_from() -> None:
+    extras = metadata(ROOT)["project"]["optional-dependencies"]
+    for page in (ROOT / "README.md", ROOT / "docs" / "howto" / "install.md"):
+        text = page.read_text(encoding="utf-8")
+        first = re.findall(r"pip install .*", text)[0]
+        assert first.startswith("pip install torch --index-url"), "CUDA is 4.7 GB that most machines cannot use"
+        for line in re.findall(r"pip install [^`\n]*'gsstream\[(?:\w|,)+\]'", text):
+            assert "--find-links dist" in line or ON_INDEX
+            assert set(re.findall(r"\[(.*)\]", line)[0].split(",")) <= set(extras)

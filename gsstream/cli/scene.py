@@ -67,6 +67,12 @@ def prepare(
         written = write_report(out, made, found, time.perf_counter() - began)
     for finding in found:
         typer.echo(f"{finding.severity}: [{finding.code}] {finding.message}", err=True)
+    if made.points is None:
+        typer.echo(
+            "warning: the pictures share too few features for points, so nothing is known of how well the poses fit; "
+            "a run searches for points of its own",
+            err=True,
+        )
     if made.left_out:
         typer.echo(f"warning: no pose was found for {', '.join(made.left_out)}; they are left out", err=True)
     if not quiet:

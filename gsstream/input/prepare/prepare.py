@@ -29,6 +29,9 @@ from gsstream.input.recordings.calibration import CALIBRATION_FILE, SCHEMA
 from gsstream.input.seeds.mapping import Lens, Mapping, reconstruct, triangulate
 from gsstream.input.seeds.thinning import thin_points
 
+#: Fewer points than this are none: a run searches for its own.
+MIN_POINTS = 16
+
 Say = Callable[[str], None]
 
 
@@ -67,8 +70,8 @@ class Prepared:
     test: tuple[str, ...]
     mapping: Mapping
     rig: Cameras
-    points: PointCloud
-    bounds: FloatArray
+    points: PointCloud | None
+    bounds: FloatArray | None
     frames: int
     known_poses: bool
 
@@ -111,13 +114,17 @@ def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say, tell:
     rig = Cameras(
         tuple(names[i] for i in kept), mapping.viewmats[kept], np.stack([K for K, _ in lenses]), *target
     )  # fmt: skip
-    points, bounds = _points(mapping, rig, options)
-    say(f"kept {len(points)} points; writing pictures")
-    frames = _write_pictures([cameras[i] for i in kept], [lens for _, lens in lenses], out, options, tell)
+    found = _points(mapping, rig, options)
+    say(f"kept {len(found[0]) if found else 'no'} points; writing pictures")
+    counts = _write_pictures([cameras[i] for i in kept], [lens for _, lens in lenses], out, options, tell)
+    frames = min(counts)
+    if frames < max(counts):
+        told = ", ".join(f"{name} {count}" for name, count in zip(rig.ids, counts, strict=True))
+        say(f"warning: cameras differ in their frames ({told}); the first {frames} are used")
     fps = known.fps if known else options.fps
-    _write(out, title, rig, test, points, bounds, frames, fps, "" if known is None else known.licence)
+    _write(out, title, rig, test, found, frames, fps, "" if known is None else known.licence)
     left_out = tuple(name for i, name in enumerate(names) if i not in kept)
-    return Prepared(names, left_out, test, mapping, rig, points, bounds, frames, known is not None)
+    return Prepared(names, left_out, test, mapping, rig, *(found or (None, None)), frames, known is not None)
 
 
 def _map(
@@ -190,8 +197,13 @@ def _pinholes(
     return out
 
 
-def _points(mapping: Mapping, rig: Cameras, options: PrepareOptions) -> tuple[PointCloud, FloatArray]:
-    """Trustworthy points inside the bounds, thinned; bounds [2, 3]: the middle 98 % of them, and a tenth around."""
+def _points(mapping: Mapping, rig: Cameras, options: PrepareOptions) -> tuple[PointCloud, FloatArray] | None:
+    """Trustworthy points inside the bounds, thinned; bounds [2, 3]: the middle 98 % of them, and a tenth around.
+
+    None where so few were found that they say nothing: cameras far apart have no features in common.
+    """
+    if len(mapping.xyz) < MIN_POINTS:
+        return None
     good = np.isfinite(mapping.xyz).all(1) & (mapping.error <= options.max_error)
     if not good.any():
         raise InputError(
@@ -210,8 +222,8 @@ def _points(mapping: Mapping, rig: Cameras, options: PrepareOptions) -> tuple[Po
 
 def _write_pictures(
     cameras: list[RawCamera], lenses: list[Undistortion | None], out: Path, options: PrepareOptions, tell: Tell
-) -> int:
-    """Pictures of all cameras; the number of frames that all of them have."""
+) -> list[int]:
+    """Pictures of all cameras; the number of frames of each."""
     counts = []
     for number, (camera, lens) in enumerate(zip(cameras, lenses, strict=True)):
         tell("writing pictures: cameras", number, len(cameras))
@@ -229,11 +241,11 @@ def _write_pictures(
             pixels = np.round(np.clip(shown, 0, 1) * 255).astype(np.uint8)
             Image.fromarray(pixels).save(folder / f"{count - 1:06d}.png", compress_level=3)
         counts.append(count)
-    return min(counts)
+    return counts
 
 
 def _write(
-    out: Path, title: str, rig: Cameras, test: Sequence[str], points: PointCloud, bounds: FloatArray, frames: int,
+    out: Path, title: str, rig: Cameras, test: Sequence[str], found: tuple[PointCloud, FloatArray] | None, frames: int,
     fps: float, licence: str,
 ) -> None:  # fmt: skip
     entries: list[dict[str, Any]] = []
@@ -245,7 +257,9 @@ def _write(
         })  # fmt: skip
     data = {
         "schema": SCHEMA, "name": title, "fps": fps, "frames": frames, "licence": licence,
-        "bounds": bounds.tolist(), "cameras": entries,
+        **({"bounds": found[1].tolist()} if found else {}), "cameras": entries,
     }  # fmt: skip
     (out / CALIBRATION_FILE).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
-    np.savez(out / "points_frame0.npz", xyz=points.xyz, rgb=np.round(points.rgb * 255).astype(np.uint8))
+    if found:
+        points = found[0]
+        np.savez(out / "points_frame0.npz", xyz=points.xyz, rgb=np.round(points.rgb * 255).astype(np.uint8))

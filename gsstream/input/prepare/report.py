@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from gsstream.core.frame import PointCloud
 from gsstream.input.prepare.findings import Finding
 from gsstream.input.prepare.prepare import Prepared
 
@@ -16,15 +17,12 @@ REPORT, PICTURE = "report.md", "scene.png"
 def write_report(out: Path, made: Prepared, found: list[Finding], seconds: float) -> list[Path]:
     """Write both into the scene's folder; return their paths."""
     mapping = made.mapping
-    errors = mapping.camera_error[np.isfinite(mapping.camera_error)]
     lines = [
         f"# {out.name}", "",
         f"- cameras: {len(made.rig)} of {len(made.names)} placed, {len(made.test)} of them for testing only; "
         f"{'given' if made.known_poses else 'recovered'} poses",
         f"- pictures: {made.rig.width} x {made.rig.height}, {made.frames} frame{'s' if made.frames > 1 else ''}",
-        f"- mean reprojection error: {float(np.mean(mapping.error)):.3f} pixels over {len(mapping.error)} points; "
-        f"cameras {errors.min():.3f} to {errors.max():.3f}",
-        f"- points kept: {len(made.points)}; bounds {np.round(made.bounds, 3).tolist()}",
+        *_points_told(made),
         f"- seconds: {seconds:.1f}", "",
         f"![cameras and points]({PICTURE})", "",
         "| camera | use | reprojection error, pixels | points | focal length |", "|---|---|---|---|---|",
@@ -42,6 +40,17 @@ def write_report(out: Path, made: Prepared, found: list[Finding], seconds: float
     return [out / REPORT, out / PICTURE]
 
 
+def _points_told(made: Prepared) -> list[str]:
+    if made.points is None or made.bounds is None:
+        return [f"- points: none ({len(made.mapping.xyz)} found); how well the poses fit is not known"]
+    errors = made.mapping.camera_error[np.isfinite(made.mapping.camera_error)]
+    return [
+        f"- mean reprojection error: {float(np.mean(made.mapping.error)):.3f} pixels over "
+        f"{len(made.mapping.error)} points; cameras {errors.min():.3f} to {errors.max():.3f}",
+        f"- points kept: {len(made.points)}; bounds {np.round(made.bounds, 3).tolist()}",
+    ]
+
+
 def _draw(path: Path, made: Prepared) -> None:
     """Two views along the rig's axes, and the errors of the cameras."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -50,13 +59,14 @@ def _draw(path: Path, made: Prepared) -> None:
     figure = Figure(figsize=(15, 5), layout="constrained")
     FigureCanvasAgg(figure)
     up, across, ahead = _axes(made)
-    xyz = made.points.xyz - made.rig.centers.mean(0)
+    points = made.points or PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32), "none")
+    xyz = points.xyz - made.rig.centers.mean(0)
     centers, forward = made.rig.centers - made.rig.centers.mean(0), made.rig.viewmats[:, 2, :3]
     length = 0.2 * float(np.ptp(centers, axis=0).max() or 1.0)
     test = np.array([name in made.test for name in made.rig.ids])
     for number, (title, right, top) in enumerate((("from above", across, ahead), ("from the side", ahead, up))):
         plot = figure.add_subplot(1, 3, number + 1)
-        plot.scatter(xyz @ right, xyz @ top, c=made.points.rgb, s=2, linewidths=0)
+        plot.scatter(xyz @ right, xyz @ top, c=points.rgb, s=2, linewidths=0)
         for mask, color, label in ((~test, "tab:blue", "train"), (test, "tab:red", "test")):
             if mask.any():
                 place, way = centers[mask], length * forward[mask]

@@ -12,9 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
-from ruamel.yaml.nodes import MappingNode, ScalarNode, SequenceNode
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
@@ -23,6 +20,7 @@ from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, folder_clip
 from gsstream.input.recordings.distortion import Lens
 from gsstream.input.recordings.poses import from_pixel_centers, from_rotation_vector
 from gsstream.input.recordings.recorded import Recording
+from gsstream.input.recordings.storage import load_storage
 from gsstream.input.recordings.sync import RecordingWarning
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
@@ -35,7 +33,7 @@ def looks_like(folder: Path) -> bool:
 
 def read(folder: Path) -> Recording:
     """Read ENeRF-Outdoor: 18 cameras, 1920 x 1080, 30 frames per second; the test camera is the first, 00 (paper)."""
-    intri, extri = _load(folder / INTRINSICS), _load(folder / EXTRINSICS)
+    intri, extri = load_storage(folder / INTRINSICS), load_storage(folder / EXTRINSICS)
     names = intri.get("names")
     if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
         raise SourceError(f"{folder / INTRINSICS}: 'names' must list the cameras")
@@ -75,32 +73,6 @@ def _clip_of(folder: Path, name: str) -> Clip | None:
 
             return VideoClip(path)
     return None
-
-
-def _load(path: Path) -> dict[str, Any]:
-    """OpenCV's YAML: a first line that YAML does not know, and matrices under a tag of their own."""
-    try:
-        text = path.read_text(encoding="utf-8")
-        # "%YAML:1.0" is no YAML directive; "- 00" in a list of names must stay a text.
-        body = "\n".join(line for line in text.splitlines() if not line.startswith("%YAML"))
-        node = YAML(typ="safe", pure=True).compose(body)
-    except (OSError, UnicodeDecodeError) as error:
-        raise SourceError(f"{path}: cannot be read: {error}") from error
-    except YAMLError as error:
-        place = str(error).splitlines()
-        raise SourceError(f"{path}: not valid YAML: {place[0] if place else error}") from error
-    if not isinstance(node, MappingNode):
-        raise SourceError(f"{path}: expected names, K_00, ... as keys")
-    return {str(key.value): _plain(value) for key, value in node.value}
-
-
-def _plain(node: Any) -> Any:
-    """Texts stay texts: "00" is a name, and numbers are read where a matrix is wanted."""
-    if isinstance(node, MappingNode):
-        return {str(key.value): _plain(value) for key, value in node.value}
-    if isinstance(node, SequenceNode):
-        return [_plain(item) for item in node.value]
-    return node.value if isinstance(node, ScalarNode) else None
 
 
 def _matrix(path: Path, data: dict[str, Any], key: str, shape: tuple[int, ...]) -> FloatArray:

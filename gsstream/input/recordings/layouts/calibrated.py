@@ -1,0 +1,99 @@
+"""Videos or pictures, and a calibration as other programs write it, recognised by what it holds.
+
+The calibration lies in the folder itself, in ``calibration/`` or in ``images/``. Pictures: a video per camera, a folder
+of pictures per camera, or one picture per camera, in the folder, in ``videos/`` or ``images/``, or in the one other
+folder with videos. There are no test cameras unless ``data.test_cameras`` names some.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import SourceError
+from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, images_in
+from gsstream.input.recordings.recorded import Recording
+from gsstream.input.recordings.rigs import metashape, opencv_yaml, qualisys, realitycapture, toml
+from gsstream.input.recordings.rigs.camera import RigCamera, matched
+
+READERS = (qualisys, toml, opencv_yaml, metashape, realitycapture)
+PLACES = (".", "calibration", "images")
+#: Larger files are no calibration.
+LARGEST = 1 << 24
+
+
+def looks_like(folder: Path) -> bool:
+    """Say whether a file holds a calibration of two cameras or more, or several files one camera each."""
+    return any(sum(len(found) for _, found in files) > 1 for files in _found(folder))
+
+
+def read(folder: Path) -> Recording:
+    """Read poses and lenses, and find the pictures of their cameras; those without pictures are left out."""
+    rigs = [files for files in _found(folder) if sum(len(found) for _, found in files) > 1]
+    if not rigs:
+        raise SourceError(f"{folder}: no calibration of two cameras or more, here or in calibration/")
+    if len(rigs) > 1:
+        told = ", ".join(str(files[0][0]) for files in rigs)
+        raise SourceError(f"{folder}: several calibrations: {told}; leave one of them there")
+    path, first = rigs[0][0]
+    # A file with a whole rig stands for itself; files of one camera each belong together.
+    cameras = first if len(first) > 1 else [camera for _, found in rigs[0] for camera in found]
+    known = {camera.name: camera for camera in cameras}
+    clips = _clips(folder)
+    try:
+        names = matched(tuple(known), tuple(clips))
+        Ks = [known[names[name]].intrinsics(clip.size) for name, clip in clips.items()]
+    except SourceError as error:
+        raise SourceError(f"{path}: {error}") from error
+    sizes = {name: clip.size for name, clip in clips.items()}
+    poses = np.stack([known[names[name]].w2c for name in clips])
+    return Recording(
+        name=folder.resolve().name,
+        where=str(path),
+        rig=Cameras(tuple(clips), poses, np.stack(Ks), *next(iter(sizes.values()))),
+        clips=clips,
+        lenses={name: known[names[name]].lens for name in clips if not known[names[name]].lens.is_identity},
+        sizes=sizes,
+    )
+
+
+def _found(folder: Path) -> Iterator[list[tuple[Path, list[RigCamera]]]]:
+    """For every format of which there are files: those files, in order of their names, and their cameras."""
+    files = [path for place in PLACES if (folder / place).is_dir() for path in sorted((folder / place).iterdir())]
+    for reader in READERS:
+        rig = [(path, reader.read(path, _text(path))) for path in files if path.suffix.lower() in reader.SUFFIXES]
+        if rig := [(path, cameras) for path, cameras in rig if cameras]:
+            yield rig
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig") if path.is_file() and path.stat().st_size <= LARGEST else ""
+    except (OSError, UnicodeDecodeError):
+        return ""  # no text, so no calibration; nothing is said of files that are not asked for
+
+
+def _clips(folder: Path) -> dict[str, Clip]:
+    inside = [path for path in sorted(folder.iterdir()) if path.is_dir()]
+    with_videos = [path for path in inside if len(_videos(path)) > 1]
+    places = [folder, folder / "videos", folder / "images", *(with_videos if len(with_videos) == 1 else [])]
+    for place in places:
+        if len(videos := _videos(place)) > 1:
+            from gsstream.input.recordings.video import VideoClip
+
+            return {path.stem: VideoClip(path) for path in videos}
+    for place in places:
+        cameras = [path for path in sorted(place.iterdir()) if images_in(path)] if place.is_dir() else []
+        if len(cameras) > 1:
+            return {path.name: folder_clip(path) for path in cameras}
+    for place in places:
+        if len(pictures := images_in(place)) > 1:
+            return {path.stem: ImageClip([path]) for path in pictures}
+    raise SourceError(f"{folder}: no videos or pictures of two cameras or more, here, in videos/ or in images/")
+
+
+def _videos(place: Path) -> list[Path]:
+    return [p for p in sorted(place.iterdir()) if p.suffix.lower() in VIDEO_SUFFIXES] if place.is_dir() else []

@@ -1,0 +1,77 @@
+"""RealityCapture (RealityScan): metadata beside the pictures (``*.xmp``) or "internal/external parameters" (``*.csv``).
+
+Lengths are shares of the longer side: the focal length of 35 mm film over 36, the principal point from the middle (the
+table has it in film millimetres). XMP: rotation row by row, world to camera with OpenCV axes, and the centre. CSV:
+heading, pitch and roll in degrees, and the centre.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from gsstream.core.errors import SourceError
+from gsstream.core.shapes import FloatArray
+from gsstream.input.recordings.distortion import Lens
+from gsstream.input.recordings.poses import from_opengl, from_rotation_vector
+from gsstream.input.recordings.rigs.camera import RigCamera
+
+SUFFIXES = (".xmp", ".csv")
+FILM = 36.0
+_SPACE = "{http://www.capturingreality.com/ns/xcr/1.1#}"
+
+
+def read(path: Path, text: str) -> list[RigCamera]:
+    """Return the camera of an XMP file, or all of a table; none when it is of another format."""
+    try:
+        if "capturingreality.com/ns/xcr" in text:
+            return [_from_metadata(path, ElementTree.fromstring(text))]
+        if text.startswith("#name,") and "heading" in text.split("\n", 1)[0]:
+            return [_from_row(path, row) for row in csv.DictReader(text.splitlines())]
+    except (ElementTree.ParseError, KeyError, ValueError, TypeError) as error:
+        raise SourceError(f"{path}: not cameras of RealityCapture: {error!r}") from error
+    return []
+
+
+def _from_metadata(path: Path, root: ElementTree.Element) -> RigCamera:
+    found = {key: value for entry in root.iter() for key, value in entry.attrib.items()}
+    found |= {entry.tag: entry.text or "" for entry in root.iter() if not len(entry)}
+
+    def numbers(key: str) -> list[float]:
+        return [float(word) for word in found[_SPACE + key].split()]
+
+    w2c = np.eye(4)
+    w2c[:3, :3] = np.array(numbers("Rotation")).reshape(3, 3)
+    w2c[:3, 3] = -w2c[:3, :3] @ numbers("Position")
+    model = found[_SPACE + "DistortionModel"]
+    coefficients = numbers("DistortionCoeficients")  # the format's own spelling
+    if not model.startswith("brown") and any(coefficients):
+        raise SourceError(f"{path}: the lens model {model!r} is not supported; export with a model of Brown")
+    u, v = numbers("PrincipalPointU")[0], numbers("PrincipalPointV")[0]
+    return _made(path, path.stem, w2c, (numbers("FocalLength35mm")[0] / FILM, u, v), coefficients)
+
+
+def _from_row(path: Path, row: dict[str, str]) -> RigCamera:
+    heading, pitch, roll = (np.radians(float(row[key])) for key in ("heading", "pitch", "roll"))
+    turns = zip((2, 0, 1), (-heading, pitch, roll), strict=True)
+    z, x, y = (from_rotation_vector(angle * np.eye(3)[axis]) for axis, angle in turns)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = z @ x @ y, [float(row[key]) for key in ("x", "y", "alt")]
+    f, u, v = (float(row[key]) / FILM for key in ("f", "px", "py"))
+    coefficients = [float(row[key]) for key in ("k1", "k2", "k3", "k4", "t1", "t2")]
+    return _made(path, Path(row["#name"]).stem, from_opengl(pose), (f, u, v), coefficients)
+
+
+def _made(
+    path: Path, name: str, w2c: FloatArray, optics: tuple[float, float, float], coefficients: Sequence[float]
+) -> RigCamera:
+    k1, k2, k3, k4, t1, t2 = coefficients
+    if k4:
+        raise SourceError(f"{path}: camera {name!r}: k4 is not supported: align with a model of Brown without it")
+    f, u, v = optics
+    K = np.array([[f, 0, u], [0, f, v], [0, 0, 1.0]])
+    return RigCamera(name, w2c, K, Lens("radial", (k1, k2, k3), (t1, t2)), None)

@@ -26,8 +26,9 @@ REACH = 0.3
 PARTNERS = 12
 #: Least correlation with the others, and least fall of it away from the best offset, with which a clock is known.
 ALIKE, FALL = 0.3, 0.05
-#: Least offset that is claimed, frames; least gain of correlation by it; least share of the partners that agree.
-LEAST, GAIN, VOTES = 0.7, 0.01, 0.75
+#: Least offset that is claimed, frames; least gain of correlation by it, and the same times the frames squared (few
+#: frames say little); least share of the partners that agree.
+LEAST, GAIN, GAIN_OF_FEW, VOTES = 0.7, 0.01, 12.0, 0.75
 #: So many of the cameras that are least like the others, and clearly less than usual, are tried with each other's pose;
 #: both must become so much more like the others.
 SUSPECTS, STAND_OUT, EXCHANGED = 6, 0.92, 0.1
@@ -52,7 +53,7 @@ def check_sync(thumbs: Thumbnails) -> list[Finding]:
         return [note("sync", f"clocks: not checkable ({have}; expected at least 3 and 4)")]
     seen = motions(thumbs)
     curves = _curves(cameras, seen, reach)
-    clocks = _clocks(curves)
+    clocks = _clocks(curves, len(thumbs.images))
     if swapped := _swapped(cameras, seen, curves[:, :, reach]):
         return swapped
     lost = [c for c, clock in enumerate(clocks) if clock.late is None]
@@ -104,18 +105,18 @@ def _pairs(cameras: Cameras) -> list[tuple[int, int]]:
     return [(a, int(b)) for a, partners in enumerate(neighbour_views(cameras, PARTNERS)) for b in partners]
 
 
-def _clocks(curves: FloatArray) -> list[Clock]:
+def _clocks(curves: FloatArray, frames: int) -> list[Clock]:
     """The clock of every camera: the largest offset first, whose camera then no longer weighs on the others."""
-    count, reach = len(curves), curves.shape[2] // 2
+    count, reach, least = len(curves), curves.shape[2] // 2, max(GAIN, GAIN_OF_FEW / frames**2)
     moved = np.zeros(count, int)
     for _ in range(count):
         rows = [_row(curves, c, moved) for c in range(count)]
-        gains = [_gain(row, reach + moved[c]) for c, row in enumerate(rows)]
+        gains = [_gain(row, reach + moved[c], least) for c, row in enumerate(rows)]
         worst = int(np.argmax(gains))
         if gains[worst] <= 0:
             break
         moved[worst] = int(np.nanargmax(rows[worst].mean)) - reach
-    return [_clock(_row(curves, c, moved), reach) for c in range(count)]
+    return [_clock(_row(curves, c, moved), reach, least) for c in range(count)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +143,7 @@ def _mean(values: FloatArray) -> FloatArray:
     return mean
 
 
-def _gain(row: _Row, now: int) -> float:
+def _gain(row: _Row, now: int, least: float) -> float:
     """How much more like the others a camera is at its best offset than at ``now``; 0 where that is not sure."""
     if np.isnan(row.mean).all() or np.isnan(row.mean[now]):
         return 0.0
@@ -150,15 +151,15 @@ def _gain(row: _Row, now: int) -> float:
     better = row.each[:, best] - row.each[:, now]
     better = better[np.isfinite(better)]
     gain = float(row.mean[best] - row.mean[now])
-    sure = gain >= GAIN and row.mean[best] >= ALIKE and float((better > 0).mean()) >= VOTES
+    sure = gain >= least and row.mean[best] >= ALIKE and float((better > 0).mean()) >= VOTES
     return gain if sure and abs(_peak(row.mean) - now) >= LEAST else 0.0
 
 
-def _clock(row: _Row, reach: int) -> Clock:
+def _clock(row: _Row, reach: int, least: float) -> Clock:
     known = row.mean[np.isfinite(row.mean)]
     if not len(known) or known.max() < ALIKE or known.max() - known.min() < FALL:
         return Clock(None)
-    if not _gain(row, reach):
+    if not _gain(row, reach, least):
         return Clock(0.0)
     peak = _peak(row.mean)
     return Clock(peak - reach, ended=round(peak) in (0, 2 * reach))

@@ -19,7 +19,7 @@ LAYOUTS = {
     "panoptic": ("panoptic", "train_meta.json, ims/"),
     "colmap": ("colmap", "sparse/0/ and images/ or videos/"),
     "nerfstudio": ("nerfstudio", "transforms.json"),
-    "calibrated": ("calibrated", "videos or images/, and a calibration of another program (docs/howto/prepare.md)"),
+    "calibrated": ("calibrated", "videos or images/, and a calibration of Qualisys, Caliscope, ..."),
 }
 
 

@@ -42,9 +42,7 @@ def qualisys(folder: Path) -> None:
     for name, pose in zip(NAMES, poses(), strict=True):
         given = FLIP @ pose
         center = -given[:3, :3].T @ given[:3, 3]
-        turn = " ".join(f'r{i + 1}{j + 1}="{given[i, j]!r}"' for i in range(3) for j in range(3)).replace(
-            "np.float64", ""
-        )
+        turn = " ".join(f'r{i + 1}{j + 1}="{float(given[i, j])!r}"' for i in range(3) for j in range(3))
         where = " ".join(f'{axis}="{float(value)!r}"' for axis, value in zip("xyz", center, strict=True))
         k1, k2, p1, p2, k3 = DISTORTION
         cameras += (

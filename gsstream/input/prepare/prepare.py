@@ -115,6 +115,7 @@ def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say, tell:
         tuple(names[i] for i in kept), mapping.viewmats[kept], np.stack([K for K, _ in lenses]), *target
     )  # fmt: skip
     found = _points(mapping, rig, options)
+    points, bounds = found if found else (None, None)
     say(f"kept {len(found[0]) if found else 'no'} points; writing pictures")
     counts = _write_pictures([cameras[i] for i in kept], [lens for _, lens in lenses], out, options, tell)
     frames = min(counts)
@@ -124,7 +125,7 @@ def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say, tell:
     fps = known.fps if known else options.fps
     _write(out, title, rig, test, found, frames, fps, "" if known is None else known.licence)
     left_out = tuple(name for i, name in enumerate(names) if i not in kept)
-    return Prepared(names, left_out, test, mapping, rig, *(found or (None, None)), frames, known is not None)
+    return Prepared(names, left_out, test, mapping, rig, points, bounds, frames, known is not None)
 
 
 def _map(

@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -42,6 +42,9 @@ class Signs:
         clock: seconds that only grow.
     """
 
+    #: When others were closed last, and when they had printed last.
+    _before: ClassVar[tuple[float, float]] = (-1.0, -1.0)
+
     def __init__(self, quiet: bool, clock: Callable[[], float] = time.monotonic) -> None:
         from rich.console import Console
 
@@ -57,7 +60,9 @@ class Signs:
         self._first = 0
 
     def __enter__(self) -> Signs:
-        self._printed = self._clock()
+        # What follows at once on other signs goes on with their silence.
+        closed, printed = Signs._before
+        self._printed = printed if 0 <= self._clock() - closed < 1 else self._clock()
         if self._live:
             from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -73,6 +78,7 @@ class Signs:
         return self
 
     def __exit__(self, *_: object) -> None:
+        Signs._before = self._clock(), self._printed
         self._over.set()
         if self._bar:
             self._bar.stop()
@@ -106,7 +112,7 @@ class Signs:
 
     def line(self) -> str:
         """Return what is done now, in one line."""
-        parts = [f"{self._what}: {self._done}/{self._total}" if self._total else self._what]
+        parts = [f"{self._what} {self._done}/{self._total}" if self._total else self._what]
         parts += [self._note] if self._note else []
         waited, left = self._clock() - self._changed, self.left()
         if waited >= EVERY:

@@ -75,7 +75,7 @@ def test_work_that_says_nothing_is_shown_every_few_seconds(capsys: pytest.Captur
         while said.count("\n") < 2 and time.monotonic() < deadline:
             time.sleep(0.05)
             said += capsys.readouterr().err
-    assert re.fullmatch(r"(looking for points: 3/50, [\d.]+ (seconds|minutes) on this one\n)+", said)
+    assert re.fullmatch(r"(looking for points 3/50, [\d.]+ (seconds|minutes) on this one\n)+", said)
     with Signs(True, lambda: 1000 * time.monotonic()) as signs:
         signs.tell("looking for points", 3, 50)
         time.sleep(0.6)

@@ -39,7 +39,7 @@ class RunProgress(Signs):
         self._announce(iteration, iterations)
         self.tell("frame 0: iteration", iteration, iterations, note)
         if iteration == iterations or self.due():
-            self.say(self.line().replace("iteration:", "iteration"))
+            self.say(self.line())
         if iteration == iterations:
             self.tell("frame 0: writing its packet")
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from gsstream.core.frame import Frame
 from gsstream.encode import open_recording
 from gsstream.engine.run.measure import HeldOut
 from gsstream.input.prepare.pose_checks import check_poses, first_look
+from gsstream.input.recordings.base import FrameSource
 from gsstream.plugins.catalog import load_catalog
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -31,6 +34,16 @@ def frame() -> Frame:
     with open_recording("demo") as source:
         assert first_look(source) == []
         return source.frame(0)
+
+
+def test_a_black_camera_is_named_before_a_run(frame: Frame) -> None:
+    with open_recording("demo") as source:
+        images = frame.images.copy()
+        images[2] = 0
+        black = SimpleNamespace(info=source.info, frame=lambda index, split="train": replace(frame, images=images))
+        (finding,) = first_look(cast("FrameSource", black))
+        assert finding.code == "blank"
+        assert f"camera {source.info.train.ids[2]!r} is black" in finding.message
 
 
 @pytest.mark.parametrize("name", WRONG)

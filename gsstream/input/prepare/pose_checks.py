@@ -16,6 +16,7 @@ from gsstream.core.frame import Frame, shrink_frame
 from gsstream.core.shapes import FloatArray
 from gsstream.input.prepare.findings import Finding, error
 from gsstream.input.prepare.match_checks import REPAIRS
+from gsstream.input.prepare.picture_checks import Thumbnails, check_blank
 from gsstream.input.prepare.rig_checks import check_axes, check_intrinsics, check_overlap, check_placement
 from gsstream.input.recordings.base import FrameSource
 from gsstream.input.recordings.canonical import to_file_coordinates
@@ -44,10 +45,12 @@ def first_look(source: FrameSource) -> list[Finding]:
     if found:
         return found[:1]
     found = check_overlap(train, train.ids) if len(train) > 1 else []
-    if source.info.num_frames is None or len(train) < 3:
+    if source.info.num_frames is None:
         return found[:1]
     try:
-        return check_poses(source.frame(0, "train")) or found[:1]
+        frame = source.frame(0, "train")
+        blank = check_blank(Thumbnails(frame.images[None], train, len(train)))
+        return blank[:1] or check_poses(frame) or found[:1]
     except EndOfRecording:
         return found[:1]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 import zipfile
 import zlib
 from pathlib import Path
@@ -15,8 +16,11 @@ from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.base import FilesMissing, PointKind, SourceInfo, Split, check_index
 from gsstream.input.recordings.calibration import Calibration, frame_path, read_calibration
 from gsstream.input.recordings.images import read_image
+from gsstream.input.recordings.sync import RecordingWarning
 
 POINTS_FILE = "points_frame0.npz"
+#: Steps of float32 above this share of the points' spread move them visibly.
+COARSE = 1e-3
 
 
 class MultiviewSource:
@@ -114,6 +118,15 @@ def read_points(path: Path, kind: PointKind) -> PointCloud:
         fits = np.isfinite(xyz.astype(np.float32))
     if not fits.all():
         raise SourceError(f"{path}: {int((~fits).any(1).sum())} of {len(xyz)} points are not finite")
+    if xyz.dtype == np.float32 and len(xyz) > 1:
+        step = float(np.spacing(np.abs(xyz).max()))
+        spread = float(np.median(np.abs(xyz - np.median(xyz, axis=0))))
+        if step > COARSE * spread:
+            warnings.warn(
+                f"{path}: {prefix}xyz is float32, whose steps are {step:.2g} this far from the origin, and the points "
+                f"spread over {spread:.2g}: write float64, or move poses and points to the origin",
+                RecordingWarning, stacklevel=2,
+            )  # fmt: skip
     colors = rgb.astype(np.float32) / np.float32(255)
     return PointCloud(xyz.astype(np.float64), colors, f"{path.name} ({kind})")
 

@@ -61,7 +61,16 @@ def _lengths(clips: Mapping[str, Clip], start: int, stop: int) -> list[str]:
     if len(spans) == 1:
         return []
     told = ", ".join(f"{i} {c.num_frames} from {c.first}" for i, c in clips.items() if c.num_frames != stop - start)
-    return [f"cameras differ in their frames ({told}); the {stop - start} common ones are used, from number {start}"]
+    limits = [
+        i
+        for i, c in clips.items()
+        if (c.first == start and any(o.first < start for o in clips.values()))
+        or (c.first + c.num_frames == stop and any(o.first + o.num_frames > stop for o in clips.values()))
+    ]
+    return [
+        f"cameras differ in their frames ({told}); the {stop - start} common ones are used, from number {start}; the "
+        f"span is that of {', '.join(limits)}"
+    ]
 
 
 def _common_rate(name: str, videos: Mapping[str, VideoClip], frames: int) -> float:

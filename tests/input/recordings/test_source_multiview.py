@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,9 @@ from PIL import Image
 
 from gsstream.core.errors import SourceError
 from gsstream.input.recordings.images import shrink
-from gsstream.input.recordings.multiview import MultiviewSource
+from gsstream.input.recordings.multiview import MultiviewSource, read_points
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
+from gsstream.input.recordings.sync import RecordingWarning
 
 Edit = Callable[[dict[str, Any]], None]
 
@@ -201,6 +203,19 @@ def test_wrong_size_transparency_and_late_loss_are_named(tmp_path: Path) -> None
 def test_frames_outside_the_recording(tmp_path: Path, index: int) -> None:
     with pytest.raises(SourceError, match=f"has no frame {index}; it has 2"):
         MultiviewSource(make_recording(tmp_path / "r")).frame(index)
+
+
+def test_points_that_float32_rounds_far_from_the_origin_are_named(tmp_path: Path) -> None:
+    near = np.random.default_rng(0).normal(size=(50, 3))
+    far, rgb = near + np.array([400_000.0, 5_000_000.0, 30.0]), np.zeros((50, 3), np.uint8)
+    np.savez(tmp_path / "coarse.npz", xyz=far.astype(np.float32), rgb=rgb)
+    with pytest.warns(RecordingWarning, match=r"float32, whose steps are 0\.5 .* write float64"):
+        read_points(tmp_path / "coarse.npz", "recording")
+    for xyz in (far, near.astype(np.float32)):
+        np.savez(tmp_path / "fine.npz", xyz=xyz, rgb=rgb)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert np.array_equal(read_points(tmp_path / "fine.npz", "recording").xyz, xyz)
 
 
 def test_points_variants_and_faults(tmp_path: Path) -> None:

@@ -147,11 +147,12 @@ def test_before_the_first_packet_it_stops_at_once(tmp_path: Path, number: str, c
     """Nothing would be lost, and frame 0 would take hours here."""
     out, options = tmp_path / "o", {"first_frame__max_iterations": 10_000_000, "first_frame__epochs": 10_000_000}
     process = start(*arguments(out, **options))
-    wait_for((out / "stream.gss").exists, process)
+    stream = out / "stream.gss"
+    wait_for(lambda: stream.exists() and stream.stat().st_size > 0, process)
     os.kill(process.pid, getattr(signal, number))
     _, err = process.communicate(timeout=600)
     assert (process.returncode, err) == (code, f"{said}\n")
-    with StreamReader(out / "stream.gss") as reader:
+    with StreamReader(stream) as reader:
         assert reader.entries == []
         assert reader.damage is None
 

@@ -137,7 +137,8 @@ def _map(
     if known is None:
         # Pictures of different sizes come from different lenses.
         shared = one_size and not options.each
-        return reconstruct(images, model=options.model, shared=shared, held=held, tell=tell)
+        names = [camera.name for camera in cameras]
+        return reconstruct(images, model=options.model, shared=shared, held=held, names=names, tell=tell)
     training = [i for i in range(len(cameras)) if i not in held]
     size = _smallest([cameras[i] for i in training])
     tell("undistorting frame 0", 0, 0)

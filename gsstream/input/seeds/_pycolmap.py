@@ -150,7 +150,8 @@ def reconstruct(folder: Path) -> None:
         match_pairs(folder, database, rest)  # they were not taken one after the other
         best = _map(folder, database, free, "second")
     if best is None:
-        raise SystemExit("no pair of images shares enough features to begin with")
+        np.savez(folder / "apart.npz", **_matches_of(database))
+        return
     poses = {int(Path(image.name).stem): image.cam_from_world() for image in best.images.values() if image.has_pose}
     cameras = {int(Path(image.name).stem): best.cameras[image.camera_id] for image in best.images.values()}
     held_error = np.full(len(images), np.nan)
@@ -169,6 +170,18 @@ def reconstruct(folder: Path) -> None:
         cameras=np.array([cameras.get(index, known[index]).params for index in sorted(images)]),
         **_points_of(best),
     )
+
+
+def _matches_of(database: Path) -> dict[str, Any]:
+    """Verified matches of each pair of images: ``pairs`` [K, 2] by the numbers in their names, ``counts`` [K]."""
+    with pycolmap.Database.open(database) as db:
+        images = sorted((int(Path(image.name).stem), image.image_id) for image in db.read_all_images())
+        pairs, counts = [], []
+        for (a, first), (b, second) in itertools.combinations(images, 2):
+            known = db.exists_two_view_geometry(first, second)
+            pairs.append((a, b))
+            counts.append(len(db.read_two_view_geometry(first, second).inlier_matches) if known else 0)
+    return {"pairs": np.array(pairs, np.int64).reshape(-1, 2), "counts": np.array(counts, np.int64)}
 
 
 def _map(folder: Path, database: Path, names: list[str], turn: str) -> Any:

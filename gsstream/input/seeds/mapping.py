@@ -12,6 +12,7 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
+from gsstream.core.needs import page
 from gsstream.core.shapes import BoolArray, FloatArray, IntArray
 from gsstream.core.signs import Tell, silent
 from gsstream.input.seeds.sfm import run_pycolmap, write_images, write_rig
@@ -69,11 +70,12 @@ class Mapping:
 
 def reconstruct(
     images: Sequence[FloatArray] | FloatArray, *, model: str = "SIMPLE_RADIAL", shared: bool = True,
-    held: Sequence[int] = (), timeout: float = 1800.0, tell: Tell = silent,
+    held: Sequence[int] = (), names: Sequence[str] = (), timeout: float = 1800.0, tell: Tell = silent,
 ) -> Mapping:  # fmt: skip
     """Map C images [H, W, 3] in [0, 1] of one instant; of different sizes, unless they share a lens.
 
-    The same input gives the same result. Raises InputError when pycolmap is missing or finds nothing to begin with.
+    ``names``: of the cameras, for messages. The same input gives the same result. Raises InputError when pycolmap is
+    missing, and, with the matches of each pair, when it finds nothing to begin with.
     """
     if model not in LENSES:
         raise InputError(f"lens model: expected one of {', '.join(LENSES)}, got {model!r}")
@@ -82,10 +84,24 @@ def reconstruct(
         write_images(folder, images)
         np.savez(folder / "job.npz", model=model, shared=shared, held=np.array(held, np.int64))
         run_pycolmap("reconstruct", folder, timeout, tell)
+        if (folder / "apart.npz").exists():
+            with np.load(folder / "apart.npz") as result:
+                raise InputError(_apart(result["pairs"], result["counts"], names))
         with np.load(folder / "points.npz") as result:
             found = dict(result)
     lenses = tuple(Lens(model, tuple(map(float, params))) for params in found["cameras"])
     return _mapping(found, found["viewmats"], lenses)
+
+
+def _apart(pairs: IntArray, counts: IntArray, names: Sequence[str]) -> str:
+    most = np.argsort(-counts, kind="stable")[:10]
+    told = ", ".join(" and ".join(names[i] if names else str(i) for i in pairs[k]) + f" {counts[k]}" for k in most)
+    more = f", and {len(counts) - len(most)} pairs with no more" if len(counts) > len(most) else ""
+    return (
+        f"structure from motion: no two pictures share enough features to begin with (matches: {told}{more}); give "
+        "poses instead: calibrate the cameras with a board and put the calibration beside the pictures "
+        f"({page('howto/prepare.md')})"
+    )
 
 
 def triangulate(images: FloatArray, cameras: Cameras, *, timeout: float = 1800.0, tell: Tell = silent) -> Mapping:

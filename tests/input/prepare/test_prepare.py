@@ -185,7 +185,7 @@ def test_what_cannot_be_prepared_is_said(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="cameras found: 1; expected at least two"):
         find_cameras(tmp_path / "raw")
     save(tmp_path / "raw" / "other.png", np.zeros((8, 9, 3)))
-    with pytest.raises(InputError, match="structure from motion"):
+    with pytest.raises(InputError, match=r"no two pictures share .*\(matches: only and other 0\); give poses instead"):
         prepare(tmp_path / "raw", tmp_path / "scene", PrepareOptions(), quiet)
     with pytest.raises(InputError, match="--test: no camera 'anything'"):
         prepare(tmp_path / "raw", tmp_path / "scene", PrepareOptions(test=("anything",)), quiet)

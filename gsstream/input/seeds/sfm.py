@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 import subprocess
 import sys
@@ -76,8 +77,9 @@ def run_pycolmap(task: str, folder: Path, timeout: float, tell: Tell = silent) -
             "or give the recording a points_frame0.npz"
         )
     command = [sys.executable, "-m", "gsstream.input.seeds._pycolmap", task, str(folder)]
+    # COLMAP's logger leaves a file for every process where temporary files go: that folder is removed with the rest.
     with (folder / "log.txt").open("w") as log, subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=log, text=True
+        command, stdout=subprocess.PIPE, stderr=log, text=True, env={**os.environ, "TMPDIR": str(folder)}
     ) as process:  # fmt: skip
         late = threading.Timer(timeout, process.kill)
         late.start()

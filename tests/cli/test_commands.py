@@ -36,7 +36,7 @@ OPTIONS = {
     "gsstream": ["--debug", "--version", "--install-completion", "--show-completion"],
     "gsstream run": [
         "--source", "--out", "--method", "--recipe", "--set", "--budget", "--frames", "--scale", "--first-frame",
-        "--resume", "--overwrite", "--no-video", "--no-pictures", "--quiet", "--serve",
+        "--resume", "--overwrite", "--no-video", "--no-pictures", "--quiet", "--serve", "--renderer",
     ],
     "gsstream scene": [],
     "gsstream scene prepare": [

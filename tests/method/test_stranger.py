@@ -116,7 +116,7 @@ class Row:
 ROWS = {
     "no budget": Row({}, (0, 3, 6)),
     "room for all": Row({"budget.size": "1MB", "budget.time": "1000s"}, (0, 3, 6), epochs=30),
-    "few bytes": Row({"budget.size": "70B"}, (0,), "bytes where 70 are allowed"),
+    "few bytes": Row({"budget.size": "80B"}, (0,), "bytes where 80 are allowed"),
     "no time": Row({"budget.time": "0.000001s"}, (0,), "s are allowed for the frame", epochs=0),
     "colour maps of cameras": Row({"first_frame.exposure": True}, (0, 3, 6)),
 }  # fmt: skip

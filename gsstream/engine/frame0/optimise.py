@@ -185,16 +185,16 @@ class FirstFrameRun:
     def passes(self, first: int, last: int) -> Iterator[int]:
         """Make the iterations from first to last, and yield the number of each.
 
-        What they computed is looked at after every pass over the views: a GPU is waited for with each look.
+        On a GPU they are made and looked at by passes over the views: it is waited for with each look.
         """
-        for begin in range(first, last + 1, self.views):
+        at_once = 1 if self.device == CPU else self.views
+        for begin in range(first, last + 1, at_once):
+            numbers = range(begin, min(begin + at_once, last + 1))
             with deferred_checks(self.parts.checks is not Checks.STEP):
-                for iteration in range(begin, min(begin + self.views, last + 1)):
+                for iteration in numbers:
                     self.step(iteration)
-                    if self.device == CPU:
-                        self._read_losses()
-                    yield iteration
             self._read_losses()
+            yield from numbers
 
     def _read_losses(self) -> None:
         for loss in torch.stack(self.losses).cpu().tolist() if self.losses else ():

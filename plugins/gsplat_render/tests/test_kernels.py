@@ -39,7 +39,8 @@ def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[pytest.
     ones = torch.ones
     monkeypatch.setattr(torch, "ones", lambda *size, device=None: ones(*size))
     for name in ("CUDA_HOME", "CUDA_PATH", "LIBRARY_PATH"):
-        monkeypatch.delenv(name, raising=False)
+        monkeypatch.setenv(name, "")  # so that what is set in between is taken back
+        monkeypatch.delenv(name)
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr("sysconfig.get_path", lambda *_: str(tmp_path))
     yield monkeypatch

@@ -292,7 +292,7 @@ def test_photographs_become_a_picture_by_the_printed_commands_alone(
     assert scene.ids == tuple(f"{number:04d}" for number in range(6))
     assert (scene.width, scene.height) == (304, 240)
     assert np.allclose(scene.viewmats, rig.viewmats, atol=1e-9)
-    assert run_command(["run", "--source", made[1], *few]) == 0
+    assert run_command(["run", "--source", made[1], *few]) == 0, capsys.readouterr().err
     (setting,) = re.findall(r"--set (\S+)$", capsys.readouterr().err, re.MULTILINE)
     assert run_command(["run", "--source", made[1], *few, "--overwrite", "--set", *shlex.split(setting)]) == 0
     assert " dB" in capsys.readouterr().err

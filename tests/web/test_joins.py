@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from join_oracle import decode_join
 from moving_scenes import make_gaussians, moving_packets
 from node_runs import HERE, NODE, needs_node, node
 
 from gsstream.core.changes import AddedGaussians, Delta, Motion, RowEdit, groups_for
 from gsstream.core.errors import PacketError
 from gsstream.packet import PlayerState, decode_packet, encode_delta
-from gsstream.serve.joins import decode_join, encode_join, track_rows
+from gsstream.serve.joins import encode_join, track_rows
 
 
 def digest(state: PlayerState) -> str:

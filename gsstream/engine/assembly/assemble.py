@@ -224,8 +224,10 @@ def _optimiser(catalog: Catalog, compiled: bool) -> Part:
 
 def _processor_only(parts: Mapping[str, Part]) -> str:
     """Which of these parts cannot work with tensors of a GPU, and why; empty where all can."""
-    found = (f"{slot} {type(part).__name__}: {part.processor_only}" for slot, part in parts.items())
-    return next((text for text in found if not text.endswith(": ")), "")
+    for slot, part in parts.items():
+        if part.processor_only:
+            return f"{slot} {type(part).__name__}: {part.processor_only}"
+    return ""
 
 
 def _choose(

@@ -19,8 +19,8 @@ from gsstream.core.part import Part
 from gsstream.plugins.catalog import Catalog
 
 VARIABLE = "GSSTREAM_DEVICE"
-#: What is tried, fastest first, before the reference is taken.
-GPU_RENDERERS, CPU_RENDERERS = ("gsplat",), ("cpu",)
+#: What is tried, in this order, before the reference is taken.
+ON_GPU, COMPILED = "gsplat", "cpu"
 
 
 class SlowRendererWarning(UserWarning):
@@ -61,16 +61,10 @@ def choose_renderer(catalog: Catalog, processor_only: str = "") -> Chosen:
         if device != "auto":
             raise PluginUnavailable(f"{VARIABLE}={device}: {found or 'there is no NVIDIA GPU that torch can use'}")
         note = found
-    reasons = []
-    for name in CPU_RENDERERS:
-        try:
-            cls = catalog.resolve("renderer", name)
-            return Chosen(name, construct("renderer", name, cls, cls.Config(), catalog), note)
-        except UnknownName:
-            reasons.append(f"no renderer named {name!r}")
-        except PluginUnavailable as error:
-            reasons.append(str(error))
-    _warn_slow(catalog, reasons)
+    renderer = _tried(catalog, COMPILED, f"no renderer named {COMPILED!r}")
+    if isinstance(renderer, Part):
+        return Chosen(COMPILED, renderer, note)
+    _warn_slow(catalog, renderer)
     cls = catalog.resolve("renderer", "reference")
     return Chosen("reference", construct("renderer", "reference", cls, cls.Config(), catalog), note)
 
@@ -85,19 +79,22 @@ def _on_gpu(catalog: Catalog, device: str, processor_only: str) -> Chosen | str:
     gpu = torch.cuda.get_device_name(None if device == "auto" else device)
     if processor_only:
         return f"{gpu} is not used: {processor_only}"
-    reasons = []
-    for name in GPU_RENDERERS:
-        try:
-            cls = catalog.resolve("renderer", name)
-            config = cls.Config() if device == "auto" else cls.Config(device=device)
-            renderer = construct("renderer", name, cls, config, catalog)
-        except UnknownName:
-            reasons.append(install_extra("gpu"))
-        except PluginUnavailable as error:
-            reasons.append(str(error))
-        else:
-            return Chosen(name, renderer, f"rendering on {gpu} with {name} {_version(name)}".rstrip())
-    return f"{gpu} is not used: {'; '.join(reasons)}"
+    settings = {} if device == "auto" else {"device": device}
+    renderer = _tried(catalog, ON_GPU, install_extra("gpu"), **settings)
+    if isinstance(renderer, Part):
+        return Chosen(ON_GPU, renderer, f"rendering on {gpu} with {ON_GPU} {_version(ON_GPU)}".rstrip())
+    return f"{gpu} is not used: {renderer}"
+
+
+def _tried(catalog: Catalog, name: str, absent: str, **settings: str) -> Part | str:
+    """The renderer, or why it does not work here; ``absent`` where no plugin declares it."""
+    try:
+        cls = catalog.resolve("renderer", name)
+        return construct("renderer", name, cls, cls.Config(**settings), catalog)
+    except UnknownName:
+        return absent
+    except PluginUnavailable as error:
+        return str(error)
 
 
 def _version(library: str) -> str:
@@ -107,12 +104,12 @@ def _version(library: str) -> str:
         return ""
 
 
-def _warn_slow(catalog: Catalog, reasons: list[str]) -> None:
+def _warn_slow(catalog: Catalog, reason: str) -> None:
     left_out = any(plugin.left_out and plugin.distribution == "gsstream-cpu-render" for plugin in catalog.plugins)
     cure = "let GSSTREAM_LOAD_PLUGINS name gsstream-cpu-render" if left_out else install_renderer()
     warnings.warn(
         "no fast renderer works here, so the reference renderer is used: about 500 times slower. To mend it, "
-        f"{cure}. Reason: {'; '.join(reasons)}",
+        f"{cure}. Reason: {reason}",
         SlowRendererWarning,
         stacklevel=4,
     )

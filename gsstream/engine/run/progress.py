@@ -26,7 +26,6 @@ class RunProgress(Signs):
         super().__init__(quiet, clock)
         self._frames = total_frames
         self._announced = False
-        self._begun: tuple[int, float] | None = None
 
     def __enter__(self) -> RunProgress:
         super().__enter__()
@@ -36,8 +35,8 @@ class RunProgress(Signs):
     def first_frame(self, iteration: int, iterations: int, loss: float, count: int) -> None:
         """Show an iteration of frame 0."""
         note = f"loss {loss:.4f}, {count} Gaussians"
-        self._announce(iteration, iterations)
         self.tell("frame 0: iteration", iteration, iterations, note)
+        self._announce(iteration, iterations)
         if iteration == iterations or self.due():
             self.say(self.line())
         if iteration == iterations:
@@ -45,14 +44,10 @@ class RunProgress(Signs):
 
     def _announce(self, iteration: int, iterations: int) -> None:
         """Warn once of a frame 0 that takes hours."""
-        if self._begun is None:
-            self._begun = iteration, self._clock()
-        first, begun = self._begun
-        gone = self._clock() - begun
-        if self._announced or gone < _SURE or iteration == first:
+        if self._announced or self._clock() - self._began < _SURE:
             return
-        left = gone / (iteration - first) * (iterations - iteration)
-        if left > _LONG:
+        left = self.left()
+        if left is not None and left > _LONG:
             self._announced = True
             warnings.warn(
                 f"frame 0 takes about {duration(left)} more at this pace ({iteration} of {iterations} iterations are "

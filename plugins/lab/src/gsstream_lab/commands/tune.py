@@ -86,15 +86,15 @@ def _limits(recipe: Recipe, source: str) -> Budget:
 
 
 def _run(plan: Plan, limits: Budget, out: Path, workers: int | None, quiet: bool) -> list[Trial]:
-    from gsstream_lab.jobs.executor import usable_processors
+    from gsstream.core.processors import processors
     from gsstream_lab.sweep.drive import run_sweep
     from gsstream_lab.sweep.table import read_table
     from gsstream_lab.sweep.tune import trial_of
 
-    processors = usable_processors()
+    usable = processors()
     # Candidates that run at the same time would slow each other down.
-    workers = workers or (1 if limits.time is not None else processors)
-    run_sweep(plan, out, WorkerOptions(workers, max(1, processors // workers)).executor(), say=progress(quiet))
+    workers = workers or (1 if limits.time is not None else usable)
+    run_sweep(plan, out, WorkerOptions(workers, max(1, usable // workers)).executor(), say=progress(quiet))
     rows = read_table(out).cells
     return [trial_of(point.variant, rows.get(point.id, {"status": "missing"}), limits) for point in plan.points]
 

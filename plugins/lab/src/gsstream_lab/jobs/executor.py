@@ -16,12 +16,8 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any
 
+from gsstream.core.processors import processors
 from gsstream_lab.jobs.base import Executor, Finished, Work, thread_environment
-
-
-def usable_processors() -> int:
-    """Return how many processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class LocalExecutor:
@@ -90,7 +86,7 @@ def make_executor(work: Work, workers: int | None, threads: int, ray: str | None
         from gsstream_lab.jobs.ray_executor import RayExecutor
 
         return RayExecutor(ray, workers, threads, work)
-    workers = workers or max(1, usable_processors() // threads)
+    workers = workers or max(1, processors() // threads)
     return LocalExecutor(workers, threads, work, ["gsstream_lab.jobs.warm"])
 
 

@@ -11,16 +11,17 @@ from typing import Any
 
 import torch
 
+from gsstream.core.processors import processors
+
 
 def machine_facts() -> dict[str, Any]:
     """Return date, processor, load and versions, without which a measured number means nothing."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
     return {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "processor": _processor(),
-        "processors_usable": usable,
+        "processors_usable": processors(),
         "gpu": gpu,
         "load_average": load,
         "system": platform.platform(),

@@ -16,7 +16,7 @@ from gsstream.cli.main import run_command
 from gsstream.core.frame import Frame
 from gsstream.encode import open_recording
 from gsstream.engine.run.measure import HeldOut
-from gsstream.input.prepare.pose_checks import check_poses, first_look
+from gsstream.input.prepare.pose_checks import check_poses, check_swapped, first_look, joined
 from gsstream.input.recordings.base import FrameSource
 from gsstream.plugins.catalog import load_catalog
 
@@ -40,10 +40,29 @@ def test_a_black_camera_is_named_before_a_run(frame: Frame) -> None:
     with open_recording("demo") as source:
         images = frame.images.copy()
         images[2] = 0
-        black = SimpleNamespace(info=source.info, frame=lambda index, split="train": replace(frame, images=images))
+        black = SimpleNamespace(info=source.info, frame=lambda index, split: replace(frame, images=images))
         (finding,) = first_look(cast("FrameSource", black))
         assert finding.code == "blank"
         assert f"camera {source.info.train.ids[2]!r} is black" in finding.message
+
+
+@pytest.mark.parametrize("pair", [(0, 8), (1, 2), (7, 3)])
+def test_swapped_cameras_are_named_and_one_wrong_pose_is_no_swap(frame: Frame, pair: tuple[int, int]) -> None:
+    """The last camera is the test camera."""
+    with open_recording("demo") as source:
+        whole = joined(frame, source.frame(0, "test"))
+        a, b = pair
+        images = whole.images.copy()
+        images[[a, b]] = images[[b, a]]
+        shown = {split: replace(f, images=images[at]) for split, f, at in
+                 (("train", frame, slice(8)), ("test", source.frame(0, "test"), slice(8, 9)))}  # fmt: skip
+        mixed = SimpleNamespace(info=source.info, frame=lambda index, split: shown[split])
+        (finding,) = first_look(cast("FrameSource", mixed))
+    first, second = (whole.cameras.ids[c] for c in sorted(pair))
+    assert f"cameras {first!r} and {second!r} are swapped" in finding.message
+    poses = whole.cameras.viewmats.copy()
+    poses[a] = FLIP @ poses[a]
+    assert check_swapped(replace(whole, cameras=replace(whole.cameras, viewmats=poses))) == []
 
 
 @pytest.mark.parametrize("name", WRONG)
@@ -68,6 +87,7 @@ def test_right_poses_raise_no_alarm_in_any_world(frame: Frame, seed: int) -> Non
     images = np.clip(frame.images * rng.uniform(0.1, 1) + rng.normal(0, 0.02, frame.images.shape), 0, 1)
     cameras = replace(frame.cameras, viewmats=poses).select(kept.tolist())
     assert check_poses(Frame(0, 0.0, images[kept].astype(np.float32), cameras)) == []
+    assert check_swapped(Frame(0, 0.0, images[kept].astype(np.float32), cameras)) == []
     assert check_poses(Frame(0, 0.0, np.full_like(images[kept], 0.5, dtype=np.float32), cameras)) == []
 
 

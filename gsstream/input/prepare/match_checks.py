@@ -47,7 +47,7 @@ def check_matches(cameras: Cameras, pairs: list[PairMatches], *, rig_only: bool 
         return _whole_rig(cameras, pairs, limit)
     if rig_only:
         return []
-    return _swapped(cameras, pairs, bad, limit) or _each(cameras, pairs, bad, limit)
+    return _each(cameras, pairs, bad, limit)
 
 
 def _suspect_cameras(cameras: Cameras, pairs: list[PairMatches], limit: float) -> list[int]:
@@ -111,20 +111,6 @@ def _whole_rig(cameras: Cameras, pairs: list[PairMatches], limit: float) -> list
         f"the pictures contradict the calibration: matches lie {usual:.1f} pixels off their epipolar lines in most "
         f"pairs of cameras, expected at most {limit:.1f}; calibrate again, or let 'gsstream scene prepare' do so"
     ))]  # fmt: skip
-
-
-def _swapped(cameras: Cameras, pairs: list[PairMatches], bad: list[int], limit: float) -> list[Finding]:
-    for a in sorted(bad):
-        for b in sorted(bad):
-            order = list(range(len(cameras)))
-            order[a], order[b] = b, a
-            moved = replace(cameras, viewmats=cameras.viewmats[order], Ks=cameras.Ks[order])
-            if a < b and not {a, b} & set(_suspect_cameras(moved, pairs, limit)):
-                return [error("epipolar", (
-                    f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r} are swapped: the pictures fit with each "
-                    "other's pose; exchange their images or their calibration"
-                ))]  # fmt: skip
-    return []
 
 
 def _each(cameras: Cameras, pairs: list[PairMatches], bad: list[int], limit: float) -> list[Finding]:

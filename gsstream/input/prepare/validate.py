@@ -19,7 +19,7 @@ from gsstream.core.needs import install_extra
 from gsstream.input.prepare.findings import Finding, error, note
 from gsstream.input.prepare.match_checks import check_matches
 from gsstream.input.prepare.picture_checks import Thumbnails, check_blank, check_change, check_same, read_thumbnails
-from gsstream.input.prepare.pose_checks import check_poses
+from gsstream.input.prepare.pose_checks import check_poses, check_swapped, joined
 from gsstream.input.prepare.rig_checks import check_axes, check_intrinsics, check_overlap, check_placement
 from gsstream.input.prepare.sync_checks import check_sync
 from gsstream.input.recordings.base import FilesMissing, FrameSource
@@ -94,10 +94,11 @@ def _stages(source: FrameSource, open_scene: Open, frames: int, features: bool) 
     clocks = check_sync(thumbs)
     if clocks and features:
         # The same for poses that are wrong in a way that no convention explains.
-        yield [finding for finding in _matched(rig, *first, rig_only=True) if finding.severity == "error"]
+        yield [finding for finding in _matched(joined(*first), rig_only=True) if finding.severity == "error"]
     yield clocks
+    yield check_swapped(joined(*first))
     if features:
-        yield _matched(rig, *first)
+        yield _matched(joined(*first))
 
 
 def _thumbnails(source: FrameSource, open_scene: Open, rig: Cameras, frames: int) -> Thumbnails:
@@ -109,11 +110,10 @@ def _thumbnails(source: FrameSource, open_scene: Open, rig: Cameras, frames: int
         small.close()
 
 
-def _matched(rig: Cameras, train: Frame, test: Frame, *, rig_only: bool = False) -> list[Finding]:
+def _matched(frame: Frame, *, rig_only: bool = False) -> list[Finding]:
     if importlib.util.find_spec("pycolmap") is None:
         return [note("epipolar", f"the calibration was not compared with the pictures: {install_extra('sfm')}")]
-    images = np.concatenate([train.images, test.images])
-    small = shrink_frame(replace(train, images=images, cameras=rig), -(-rig.width // LARGE))
+    small = shrink_frame(frame, -(-frame.cameras.width // LARGE))
     try:
         return check_matches(small.cameras, match_images(small.images), rig_only=rig_only)
     except InputError as fault:

@@ -50,9 +50,7 @@ class SweepSettings:
     workers: int = 0
 
 
-def sweep_depths(
-    images: FloatArray, cameras: Cameras, settings: SweepSettings, tell: Tell = silent
-) -> FloatArray:
+def sweep_depths(images: FloatArray, cameras: Cameras, settings: SweepSettings, tell: Tell = silent) -> FloatArray:
     """Return the planar depth of every pixel of every view, right or wrong: nothing is rejected here.
 
     Returns [C, H, W] float32, scene units. Deterministic for any number of workers.
@@ -87,26 +85,29 @@ def sweep_depths(
         return depths
 
 
-def agreement(images: FloatArray, cameras: Cameras, settings: SweepSettings, *, views: int, limit: float) -> float:
+def agreements(
+    images: FloatArray, cameras: Cameras, settings: SweepSettings, *, views: Sequence[int], limit: float
+) -> FloatArray:
     """Return how much of the texture of some views lies, at some depth, where the nearest cameras see the same.
 
     A wrong depth seldom looks right, so that poses that do not fit the images agree about next to nothing.
 
-    Returns the mean over views of the share, 0 to 1, of their textured pixels; 0 where none has texture.
+    Returns [V]: share, 0 to 1, of the textured pixels of each of these views; NaN where one has no texture.
     """
     check_shape("images", images, (len(cameras), cameras.height, cameras.width, 3))
     grey = torch.from_numpy(np.ascontiguousarray(images @ _GREY))
     partners = neighbour_views(cameras, settings.neighbours)
     near_far = depth_range(cameras)
-    shares = []
-    for view in np.unique(np.linspace(0, len(cameras) - 1, min(views, len(cameras))).round().astype(int)):
+    shares = np.full(len(views), np.nan)
+    for row, view in enumerate(views):
         root = np.linspace(near_far[view, 1] ** -0.5, near_far[view, 0] ** -0.5, settings.planes)
         inverse = (root**2).astype(np.float32)
         cost = _matching_cost(grey, cameras, view, partners[view].tolist(), inverse, settings).min(0)
         variance = _mean_and_variance(grey[view][None, None], settings.windows[0])[1][0, 0].numpy()
         textured = variance > (3 * settings.noise) ** 2
-        shares += [float((cost[textured] < limit).mean())] if textured.any() else []
-    return float(np.mean(shares)) if shares else 0.0
+        if textured.any():
+            shares[row] = float((cost[textured] < limit).mean())
+    return shares
 
 
 def _matching_cost(

@@ -262,7 +262,7 @@ BAD = (
     )),
     BadScene("unsynchronised", "a camera's clock is off by two frames", "sync", lambda f, d: early(f, "cam03", 2)),
     BadScene("swapped", "two cameras' images are swapped", "sync", lambda f, d: swap(f, "cam01", "cam05")),
-    BadScene("swapped-still", "the same, and nothing moves", "epipolar", lambda f, d: (
+    BadScene("swapped-still", "the same, and nothing moves", "axes", lambda f, d: (
         swap(f, "cam01", "cam05"), d.update(frames=1)
     )),
     BadScene("camera-to-world", "c2w where w2c is expected", "axes", lambda f, d: poses(d, np.linalg.inv)),

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
 from gsstream.input.prepare.raw import RawCamera, find_cameras
-from gsstream.input.recordings.calibration import CALIBRATION_FILE, cut_to, read_calibration
+from gsstream.input.recordings.calibration import CALIBRATION_FILE
+from gsstream.input.recordings.clips import Clip, ImageClip
 from gsstream.input.recordings.detect import LAYOUTS, detect, layouts_of, read_layout
 from gsstream.input.recordings.distortion import Lens as Distortion
-from gsstream.input.recordings.recorded import check_sizes
+from gsstream.input.recordings.layouts import declared
+from gsstream.input.recordings.recorded import Recording, check_sizes
 from gsstream.input.recordings.sync import align
 from gsstream.input.seeds.mapping import Lens
 
@@ -48,33 +48,28 @@ def read_raw(source: str) -> tuple[str, list[RawCamera], GivenRig | None]:
         named = detect(folder) if known else None
     if named is None:
         return folder.resolve().name, find_cameras(folder), None
-    return folder.resolve().name, *(_declared(folder) if named == "folder" else _laid_out(named, folder))
+    recording = declared.read(folder, any_sizes=True) if named == "folder" else read_layout(named, folder)
+    return folder.resolve().name, *_taken(recording)
 
 
-def _declared(folder: Path) -> tuple[list[RawCamera], GivenRig]:
-    cameras, known = find_cameras(folder), read_calibration(folder, to_size=True)
-    size = known.train.width, known.train.height
-    lenses = []
-    for camera, K in zip(cameras, (*known.train.Ks, *known.test.Ks), strict=True):
-        lenses.append(_lens(np.linalg.inv(cut_to(np.eye(3), camera.size, size)) @ K, None))
-    viewmats = np.concatenate([known.train.viewmats, known.test.viewmats])
-    return cameras, GivenRig(viewmats, tuple(lenses), known.test.ids, known.fps, known.licence)
-
-
-def _laid_out(layout: str, folder: Path) -> tuple[list[RawCamera], GivenRig]:
-    recording = read_layout(layout, folder)
+def _taken(recording: Recording) -> tuple[list[RawCamera], GivenRig]:
     check_sizes(recording)
     rig, beside = recording.rig, align(recording.name, recording.clips)
-    cameras = []
-    for name in rig.ids:
-        skip = beside.skip[name]
-        clip = recording.clips[name]
-        cameras.append(RawCamera(name, (), clip.size, clip, range(skip, skip + beside.num_frames)))
+    cameras = [
+        _camera(name, clip, range(beside.skip[name], beside.skip[name] + beside.num_frames))
+        for name, clip in recording.clips.items()
+    ]
     if len(cameras) < 2:
         raise SourceError(f"{recording.where}: cameras found: {len(cameras)}; expected at least two")
     lenses = tuple(_lens(K, recording.lenses.get(name)) for name, K in zip(rig.ids, rig.Ks, strict=True))
     fps = beside.fps or recording.fps
     return cameras, GivenRig(rig.viewmats, lenses, recording.test, fps, recording.licence)
+
+
+def _camera(name: str, clip: Clip, span: range) -> RawCamera:
+    """Pictures stay files, which a scene may hold as they are."""
+    files = clip.files[span.start : span.stop] if isinstance(clip, ImageClip) else ()
+    return RawCamera(name, files, clip.size) if files else RawCamera(name, (), clip.size, clip, span)
 
 
 def _lens(K: FloatArray, distortion: Distortion | None) -> Lens:

@@ -12,7 +12,6 @@ from gsstream.core.errors import ShapeError, SourceError
 from gsstream.core.names import check_camera_ids
 from gsstream.core.needs import install_extra
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.calibration import CALIBRATION_FILE, frame_path, read_calibration
 from gsstream.input.recordings.clips import Clip
 from gsstream.input.recordings.images import PICTURE_FORMATS, read_image
 from gsstream.input.recordings.video import upright
@@ -45,7 +44,7 @@ class RawCamera:
     @property
     def copied(self) -> bool:
         """Whether its pictures are files that a scene may hold as they are."""
-        return bool(self.files) and self.files[0].suffix.lower() in (".png", ".jpg")
+        return {path.suffix.lower() for path in self.files} in ({".png"}, {".jpg"})
 
     def frames(self, most: int | None) -> Iterator[FloatArray]:
         """Read the first ``most`` pictures [H, W, 3] in [0, 1]. Raises SourceError for one that cannot be read."""
@@ -62,20 +61,17 @@ class RawCamera:
 def find_cameras(folder: Path) -> list[RawCamera]:
     """Return the cameras of a raw recording, in order of their names.
 
-    Recognised: a folder with cameras.json; one folder of pictures per camera; one video per camera; one picture per
-    camera. Raises SourceError for anything else, and for fewer than two cameras.
+    Recognised: one folder of pictures per camera; one video per camera; one picture per camera. Raises SourceError for
+    anything else, and for fewer than two cameras.
     """
     if not folder.is_dir():
         raise SourceError(f"{folder}: no such folder; expected a raw recording")
-    if (folder / CALIBRATION_FILE).exists():
-        found = _declared(folder)
-    else:
-        inside = sorted(p for p in folder.iterdir() if not p.name.startswith("."))
-        folders = {p.name: _pictures(p) for p in inside if p.is_dir()}
-        found = {name: files for name, files in folders.items() if files}
-        if not found:
-            videos: dict[str, tuple[Path, ...]] = {p.stem: (p,) for p in inside if p.suffix.lower() in VIDEOS}
-            found = videos or {p.stem: (p,) for p in _pictures(folder)}
+    inside = sorted(p for p in folder.iterdir() if not p.name.startswith("."))
+    folders = {p.name: _pictures(p) for p in inside if p.is_dir()}
+    found = {name: files for name, files in folders.items() if files}
+    if not found:
+        videos: dict[str, tuple[Path, ...]] = {p.stem: (p,) for p in inside if p.suffix.lower() in VIDEOS}
+        found = videos or {p.stem: (p,) for p in _pictures(folder)}
     if len(found) < 2:
         raise SourceError(
             f"{folder}: cameras found: {len(found)}; expected at least two: a folder of pictures per camera, "
@@ -91,15 +87,6 @@ def find_cameras(folder: Path) -> list[RawCamera]:
 def first_frames(cameras: list[RawCamera]) -> list[FloatArray]:
     """Return frame 0 of every camera."""
     return [next(camera.frames(1)) for camera in cameras]
-
-
-def _declared(folder: Path) -> dict[str, tuple[Path, ...]]:
-    calibration = read_calibration(folder, to_size=True)
-    ids = (*calibration.train.ids, *calibration.test.ids)
-    return {
-        name: tuple(folder / frame_path(calibration.patterns[name], t) for t in range(calibration.num_frames))
-        for name in ids
-    }
 
 
 def _pictures(folder: Path) -> tuple[Path, ...]:

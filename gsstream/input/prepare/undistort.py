@@ -10,7 +10,6 @@ import torch
 
 from gsstream.core.errors import InputError
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.calibration import cut_to
 from gsstream.input.seeds.mapping import Lens, lens_places
 
 #: How far the pinhole's field of view may be narrowed until no pixel lies outside of the raw picture.
@@ -57,6 +56,18 @@ def undistortion(lens: Lens, size: tuple[int, int], target: tuple[int, int]) -> 
     x, y = np.meshgrid((np.arange(width) + 0.5) / factor, (np.arange(height) + 0.5) / factor)
     rays = _rays(np.stack([x.ravel(), y.ravel()], axis=1), K)
     return Undistortion(K, lens_places(lens, size, rays).reshape(height, width, 2), factor)
+
+
+def cut_to(K: FloatArray, size: tuple[int, int], target: tuple[int, int]) -> FloatArray:
+    """Return intrinsics [3, 3] of pictures shrunk evenly until they cover ``target``, and cut around their middle."""
+    across, down = target[0] / size[0], target[1] / size[1]
+    if abs(across * size[1] - target[1]) < 1:
+        scaled: FloatArray = np.diag([across, down, 1.0]) @ K
+        return scaled
+    factor = max(across, down)
+    out: FloatArray = np.diag([factor, factor, 1.0]) @ K
+    out[:2, 2] -= (factor * np.array(size) - np.array(target)) / 2
+    return out
 
 
 def _widest(lens: Lens, base: FloatArray, size: tuple[int, int], target: tuple[int, int]) -> FloatArray:

@@ -1,8 +1,9 @@
-"""cameras.json, schema "opencv-multiview-1": the rig, its split and where each camera's images lie."""
+"""cameras.json, schema "opencv-multiview-1": the rig, its split, its lenses and where each camera's images lie."""
 
 from __future__ import annotations
 
 import json
+import math
 import re
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -13,8 +14,11 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError, SourceError
 from gsstream.core.names import check_camera_ids
+from gsstream.core.needs import page
 from gsstream.input.recordings.base import Split
-from gsstream.input.recordings.clips import prepare_command
+from gsstream.input.recordings.clips import VIDEO_SUFFIXES, prepare_command
+from gsstream.input.recordings.distortion import Lens
+from gsstream.input.recordings.rigs.camera import opencv_lens
 
 SCHEMA = "opencv-multiview-1"
 #: Beyond these a file describes no recording; checked before anything is allocated or opened.
@@ -24,9 +28,14 @@ CALIBRATION_FILE = "cameras.json"
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What cameras.json says. ``patterns`` maps camera id to its image path pattern relative to the folder.
+    """What cameras.json says.
 
-    ``num_frames`` is 0 where a growing recording does not say yet.
+    Arguments:
+        num_frames: 0 where a growing recording, or one of videos alone, does not say.
+        train, test: as declared; of the size of the first camera where sizes differ.
+        patterns: camera id -> path of its video, or pattern of the paths of its images, relative to the folder.
+        lenses: camera id -> its distortion, where it has any.
+        sizes: camera id -> (width, height).
     """
 
     name: str
@@ -36,9 +45,16 @@ class Calibration:
     train: Cameras
     test: Cameras
     patterns: dict[str, str]
+    lenses: dict[str, Lens]
+    sizes: dict[str, tuple[int, int]]
+
+    @property
+    def is_raw(self) -> bool:
+        """Whether pictures have to be made of what is stored: of videos, or of pictures that a lens has bent."""
+        return bool(self.lenses) or any(map(is_video, self.patterns.values()))
 
 
-def read_calibration(folder: Path, *, growing: bool = False, to_size: bool = False) -> Calibration:
+def read_calibration(folder: Path, *, growing: bool = False, any_sizes: bool = False) -> Calibration:
     """Read and check ``folder/cameras.json``.
 
     Raises SourceError saying which file, camera or key is wrong, and what was expected.
@@ -54,19 +70,25 @@ def read_calibration(folder: Path, *, growing: bool = False, to_size: bool = Fal
     if len(set(ids)) != len(ids):
         twice = sorted({i for i in ids if ids.count(i) > 1})
         raise SourceError(f"{path}: camera ids must be unique, these occur more than once: {', '.join(twice)}")
-    rig = _rig(path, ids, cameras, to_size)
+    sizes = {i: _size(path, i, camera) for i, camera in zip(ids, cameras, strict=True)}
+    rig = _rig(path, cameras, sizes, any_sizes)
     splits = _splits(path, ids, cameras, data.get("test_cameras"))
     train = [i for i, split in enumerate(splits) if split == "train"]
     if not train:
         raise SourceError(f'{path}: there is no training camera; give at least one camera "split": "train"')
+    patterns = {i: _pattern(path, i, camera) for i, camera in zip(ids, cameras, strict=True)}
+    uncounted = "frames" not in data and (growing or all(map(is_video, patterns.values())))
+    lenses = {i: _lens(path, i, camera) for i, camera in zip(ids, cameras, strict=True)}
     return Calibration(
         name=_text(path, "name", data.get("name", folder.name), MAX_PATTERN),
         fps=_positive(path, "fps", data.get("fps", 30.0)),
-        num_frames=0 if growing and "frames" not in data else _count(path, data.get("frames")),
+        num_frames=0 if uncounted else _count(path, data.get("frames")),
         licence=_text(path, "licence", data.get("licence", ""), MAX_TEXT),
         train=rig.select(train),
         test=rig.select([i for i, split in enumerate(splits) if split == "test"]),
-        patterns={i: _pattern(path, i, camera) for i, camera in zip(ids, cameras, strict=True)},
+        patterns=patterns,
+        lenses={i: lens for i, lens in lenses.items() if not lens.is_identity},
+        sizes=sizes,
     )
 
 
@@ -81,26 +103,33 @@ def _load_json(path: Path) -> dict[str, Any]:
         raise SourceError(f"{path}: not valid JSON: {error}") from error
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error}") from error
-    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
-        got = data.get("schema") if isinstance(data, dict) else type(data).__name__
-        raise SourceError(f'{path}: expected "schema": "{SCHEMA}", got {got!r}; convert the calibration to it')
+    # A file without a schema is taken for one of this: what it holds is checked key by key.
+    if not isinstance(data, dict) or data.get("schema", SCHEMA) != SCHEMA or "cameras" not in data:
+        raise SourceError(
+            f'{path}: expected {{"schema": "{SCHEMA}", "frames": 60, "cameras": [{{"id": "cam00", "width": 1280, '
+            f'"height": 720, "K": [3 x 3], "w2c": [4 x 4], "frames": "cam00.mp4"}}, ...]}}, got {_shown(data)}; '
+            f"convert the calibration to it ({page('reference/scene-formats.md')})"
+        )
     return data
 
 
-def _rig(path: Path, ids: list[str], cameras: list[dict[str, Any]], to_size: bool) -> Cameras:
-    sizes = {i: _size(path, i, camera) for i, camera in zip(ids, cameras, strict=True)}
+def _shown(data: Any) -> str:
+    if not isinstance(data, dict):
+        return f"a {type(data).__name__}"
+    return f'"schema": {_brief(data["schema"])}' if "schema" in data else f"the keys {_brief(sorted(data))}"
+
+
+def _rig(path: Path, cameras: list[dict[str, Any]], sizes: dict[str, tuple[int, int]], any_sizes: bool) -> Cameras:
+    ids = list(sizes)
     first = sizes[ids[0]]
     for camera_id, size in sizes.items():
-        if size != first and not to_size:
+        if size != first and not any_sizes:
             raise SourceError(
                 f"{path}: all cameras of a rig must share one image size, but {ids[0]!r} is {first[0]} x {first[1]} "
                 f"and {camera_id!r} is {size[0]} x {size[1]}; to bring them to one: {prepare_command(str(path.parent))}"
             )
     poses = np.stack([_matrix(path, i, c, "w2c", 4) for i, c in zip(ids, cameras, strict=True)])
     intrinsics = np.stack([_matrix(path, i, c, "K", 3) for i, c in zip(ids, cameras, strict=True)])
-    if to_size:
-        first = min(w for w, _ in sizes.values()), min(h for _, h in sizes.values())
-        intrinsics = np.stack([cut_to(K, sizes[i], first) for i, K in zip(ids, intrinsics, strict=True)])
     rig = Cameras(tuple(ids), poses, intrinsics, *first)
     try:
         rig.validate()
@@ -110,18 +139,6 @@ def _rig(path: Path, ids: list[str], cameras: list[dict[str, Any]], to_size: boo
         if not np.allclose(poses[i, 3], (0, 0, 0, 1)) or not np.allclose(intrinsics[i, 2], (0, 0, 1)):
             raise SourceError(f"{path}: camera {camera_id!r}: the last row of w2c must be 0 0 0 1 and of K 0 0 1")
     return rig
-
-
-def cut_to(K: np.ndarray[Any, Any], size: tuple[int, int], target: tuple[int, int]) -> np.ndarray[Any, Any]:
-    """Return intrinsics [3, 3] of pictures shrunk evenly until they cover ``target``, and cut around their middle."""
-    across, down = target[0] / size[0], target[1] / size[1]
-    if abs(across * size[1] - target[1]) < 1:
-        scaled: np.ndarray[Any, Any] = np.diag([across, down, 1.0]) @ K
-        return scaled
-    factor = max(across, down)
-    out: np.ndarray[Any, Any] = np.diag([factor, factor, 1.0]) @ K
-    out[:2, 2] -= (factor * np.array(size) - np.array(target)) / 2
-    return out
 
 
 def _splits(path: Path, ids: list[str], cameras: list[dict[str, Any]], named: Any) -> list[Split]:
@@ -166,6 +183,9 @@ def _size(path: Path, camera_id: str, camera: dict[str, Any]) -> tuple[int, int]
 
 
 def _matrix(path: Path, camera_id: str, camera: dict[str, Any], key: str, side: int) -> np.ndarray[Any, Any]:
+    if key not in camera:
+        what = "intrinsics in pixels" if key == "K" else "world to camera, OpenCV axes"
+        raise SourceError(f"{path}: camera {camera_id!r} has no {key!r}; give the {side} x {side} matrix ({what})")
     try:
         matrix = np.asarray(camera.get(key), dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
@@ -177,12 +197,23 @@ def _matrix(path: Path, camera_id: str, camera: dict[str, Any], key: str, side: 
     return matrix
 
 
+def _lens(path: Path, camera_id: str, camera: dict[str, Any]) -> Lens:
+    values, fisheye, where = camera.get("distortion", []), camera.get("fisheye", False), f"{path}: camera {camera_id!r}"
+    numbers = isinstance(values, list) and all(isinstance(v, int | float) and math.isfinite(v) for v in values)
+    if not numbers or not isinstance(fisheye, bool):
+        raise SourceError(
+            f"{where}: 'distortion' must be a list of numbers (k1, k2, p1, p2, k3, ... as OpenCV has them) and "
+            f"'fisheye' true or false, got {_brief(values)} and {_brief(fisheye)}"
+        )
+    return opencv_lens(values, fisheye, f"{where}: distortion")
+
+
 def _pattern(path: Path, camera_id: str, camera: dict[str, Any]) -> str:
     pattern = camera.get("frames")
     if not isinstance(pattern, str) or not pattern:
         raise SourceError(
-            f"{path}: camera {camera_id!r} has no frames; "
-            f'give "frames" as a path pattern such as "{camera_id}/%06d.png"'
+            f'{path}: camera {camera_id!r} has no frames; give "frames" as a path pattern such as '
+            f'"{camera_id}/%06d.png", or as the path of a video'
         )
     if len(pattern) > MAX_PATTERN or re.search(r"%[^a-zA-Z]*\d{3}", pattern):
         raise SourceError(f"{path}: camera {camera_id!r}: 'frames' {_brief(pattern)} is longer than a path can be")
@@ -198,9 +229,14 @@ def _pattern(path: Path, camera_id: str, camera: dict[str, Any]) -> str:
     return pattern
 
 
+def is_video(pattern: str) -> bool:
+    """Say whether ``frames`` of a camera is the path of a video."""
+    return pattern.lower().endswith(VIDEO_SUFFIXES)
+
+
 def frame_path(pattern: str, index: int) -> str:
     """Return the relative path of a frame; a pattern without a conversion names the one image of a static set."""
-    return pattern % index if "%" in pattern else pattern
+    return pattern % index if "%" in pattern and not is_video(pattern) else pattern
 
 
 def _count(path: Path, frames: Any) -> int:

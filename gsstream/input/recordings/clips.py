@@ -63,6 +63,11 @@ class ImageClip:
         self._size = _size_of(self._files[0])
 
     @property
+    def files(self) -> tuple[Path, ...]:
+        """In order."""
+        return self._files
+
+    @property
     def where(self) -> str:
         return str(self._files[0].parent)
 

@@ -9,12 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.base import FilesMissing, PointKind, SourceInfo, Split, check_index
-from gsstream.input.recordings.calibration import Calibration, frame_path, read_calibration
+from gsstream.input.recordings.calibration import Calibration, frame_path, is_video, read_calibration
 from gsstream.input.recordings.images import read_image
 from gsstream.input.recordings.sync import RecordingWarning
 
@@ -37,10 +36,12 @@ class MultiviewSource:
     def __init__(self, folder: Path | str, *, scale: float = 1.0, uri: str | None = None) -> None:
         self._folder = Path(folder)
         calibration = read_calibration(self._folder)
+        if calibration.is_raw:
+            raise SourceError(f"{folder}: it holds videos, or 'distortion', which open_source reads")
         self._native = (calibration.train.width, calibration.train.height)
         self._target = scaled_size(self._native, scale)
         self._patterns = calibration.patterns
-        _check_files(self._folder, calibration)
+        check_files(self._folder, calibration)
         self._info = SourceInfo(
             name=calibration.name,
             uri=str(folder) if uri is None else uri,
@@ -131,30 +132,33 @@ def read_points(path: Path, kind: PointKind) -> PointCloud:
     return PointCloud(xyz.astype(np.float64), colors, f"{path.name} ({kind})")
 
 
-def _check_files(folder: Path, calibration: Calibration) -> None:
-    """Every declared image must exist before anything is trained on the first of them."""
-    for cameras in (calibration.train, calibration.test):
-        _check_rig_files(folder, cameras, calibration)
-
-
-def _check_rig_files(folder: Path, cameras: Cameras, calibration: Calibration) -> None:
-    for camera_id in cameras.ids:
+def check_files(folder: Path, calibration: Calibration) -> None:
+    """Raise SourceError for what is declared and is not there, before anything is trained on what is."""
+    for camera_id in (*calibration.train.ids, *calibration.test.ids):
         pattern = calibration.patterns[camera_id]
+        if is_video(pattern):
+            if not (folder / pattern).is_file():
+                raise FilesMissing(f"{folder}: camera {camera_id!r} has no video; expected {folder / pattern}")
+            continue
         if "%" not in pattern and calibration.num_frames > 1:
             raise SourceError(
                 f"{folder}: camera {camera_id!r}: {calibration.num_frames} frames are declared, but 'frames' "
-                f"{pattern!r} names a single image; use a pattern such as %06d"
+                f"{pattern!r} names a single image; use a pattern such as %06d, or name a video"
             )
-        _check_span(folder, camera_id, pattern, calibration.num_frames)
-        paths = [folder / frame_path(pattern, t) for t in range(calibration.num_frames)]
-        missing = [p for p in paths if not p.is_file()]
-        if len(missing) == len(paths):
-            raise FilesMissing(f"{folder}: camera {camera_id!r} has no frames; expected {missing[0]} and its followers")
-        if missing:
-            raise FilesMissing(
-                f"{folder}: camera {camera_id!r}: {len(missing)} of {len(paths)} frames are missing, the first is "
-                f'{missing[0]}; restore them or lower "frames" in cameras.json'
-            )
+        _check_images(folder, camera_id, pattern, calibration.num_frames)
+
+
+def _check_images(folder: Path, camera_id: str, pattern: str, count: int) -> None:
+    _check_span(folder, camera_id, pattern, count)
+    paths = [folder / frame_path(pattern, t) for t in range(count)]
+    missing = [p for p in paths if not p.is_file()]
+    if len(missing) == len(paths):
+        raise FilesMissing(f"{folder}: camera {camera_id!r} has no frames; expected {missing[0]} and its followers")
+    if missing:
+        raise FilesMissing(
+            f"{folder}: camera {camera_id!r}: {len(missing)} of {len(paths)} frames are missing, the first is "
+            f'{missing[0]}; restore them or lower "frames" in cameras.json'
+        )
 
 
 def _check_span(folder: Path, camera_id: str, pattern: str, count: int) -> None:

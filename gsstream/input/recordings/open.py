@@ -6,6 +6,7 @@ from pathlib import Path
 
 from gsstream.core.errors import SourceError
 from gsstream.input.recordings.base import FrameSource
+from gsstream.input.recordings.calibration import read_calibration
 from gsstream.input.recordings.detect import LAYOUTS, detect, read_layout
 from gsstream.input.recordings.multiview import MultiviewSource
 from gsstream.input.recordings.recorded import RecordedSource
@@ -47,8 +48,17 @@ def open_source(uri: str, scale: float = 1.0) -> FrameSource:
         return _nerfstudio(rest, scale, uri)
     layout = named or detect(folder)
     if layout == "folder":
-        return MultiviewSource(folder, scale=scale, uri=uri)
+        return _declared(folder, scale, uri)
     return RecordedSource(read_layout(layout, folder), scale=scale, uri=uri)
+
+
+def _declared(folder: Path, scale: float, uri: str) -> FrameSource:
+    """A folder with cameras.json."""
+    if not read_calibration(folder).is_raw:
+        return MultiviewSource(folder, scale=scale, uri=uri)
+    from gsstream.input.recordings.layouts.declared import read
+
+    return RecordedSource(read(folder), scale=scale, uri=uri)
 
 
 def _disturbed(rest: str, scale: float, uri: str) -> FrameSource:

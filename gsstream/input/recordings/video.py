@@ -24,10 +24,13 @@ class VideoClip:
     to the key frame before. Full-range and limited-range colour and the file's matrix are honoured by the decoder;
     more than 8 bits per channel are kept. Pictures are turned as the file says (phones record upright films lying).
 
-    Raises SourceError when the file cannot be read, has no picture stream or no time stamps.
+    Arguments:
+        frames: how many of its first pictures are taken; None: all.
+
+    Raises SourceError when the file cannot be read, has no picture stream or no time stamps, or fewer pictures.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, frames: int | None = None) -> None:
         self._path = path
         self._av = _load_av(path)
         self._lock = threading.Lock()
@@ -38,11 +41,7 @@ class VideoClip:
             self._check_stream(container)
             stream = container.streams.video[0]
             self._base: Fraction = stream.time_base
-            table = [
-                (p.pts, p.dts, p.is_keyframe)
-                for p in container.demux(stream)
-                if p.size and not p.is_discard
-            ]
+            table = [(p.pts, p.dts, p.is_keyframe) for p in container.demux(stream) if p.size and not p.is_discard]
             context = stream.codec_context
             # A file cut right behind its header has a stream, but nothing to learn the kind of pictures from.
             if not table or context.format is None:
@@ -58,7 +57,12 @@ class VideoClip:
             first = next(container.decode(video=0), None)
         self._rotation = 0 if first is None else int(first.rotation)
         self._size = self._stored if _quarters(path, self._rotation) % 2 == 0 else self._stored[::-1]
-        self._pts = sorted(pts for pts, _, _ in table)
+        self._pts = sorted(pts for pts, _, _ in table)[:frames]
+        if frames is not None and len(self._pts) < frames:
+            raise SourceError(
+                f"{path}: {frames} frames are declared, the video holds {len(self._pts)}: lower 'frames', or leave it "
+                "out where all cameras are videos"
+            )
         self._keys = sorted((pts, pts if dts is None else dts) for pts, dts, key in table if key)
 
     @property

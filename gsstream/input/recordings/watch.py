@@ -16,7 +16,7 @@ from gsstream.core.errors import EndOfRecording, SourceError
 from gsstream.core.frame import Arrival, Frame, PointCloud
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.base import PointKind, SourceInfo, Split
-from gsstream.input.recordings.calibration import CALIBRATION_FILE, Calibration, frame_path, read_calibration
+from gsstream.input.recordings.calibration import CALIBRATION_FILE, Calibration, frame_path, is_video, read_calibration
 from gsstream.input.recordings.images import read_image
 from gsstream.input.recordings.multiview import POINTS_FILE, read_points, scaled_size
 from gsstream.input.recordings.watch_options import WatchOptions
@@ -209,9 +209,7 @@ class WatchSource:
                 self._end(index, absent, ended)
             self._stop.wait(self._options.poll)
 
-    def _settled(
-        self, name: str, index: int, seen: dict[str, tuple[int, int]], changed: float, ended: bool
-    ) -> bool:
+    def _settled(self, name: str, index: int, seen: dict[str, tuple[int, int]], changed: float, ended: bool) -> bool:
         """Whether a camera's file counts as written; ``seen`` remembers (size, time of change) of the last look."""
         try:
             state = self._path(name, index).stat()
@@ -277,8 +275,13 @@ class WatchSource:
 
 def _check_patterns(folder: Path, calibration: Calibration) -> None:
     for name, pattern in calibration.patterns.items():
-        if "%" not in pattern:
+        if "%" not in pattern or is_video(pattern):
             raise SourceError(
-                f"{folder / CALIBRATION_FILE}: camera {name!r}: 'frames' {pattern!r} names a single image; a growing "
-                "recording needs a pattern such as %06d"
+                f"{folder / CALIBRATION_FILE}: camera {name!r}: 'frames' {pattern!r} names a single "
+                f"{'video' if is_video(pattern) else 'image'}; a growing recording needs a pattern such as %06d"
             )
+    for name in calibration.lenses:
+        raise SourceError(
+            f"{folder / CALIBRATION_FILE}: camera {name!r} has 'distortion'; a growing recording needs pictures of a "
+            "pinhole: undistort them as they come"
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,13 @@ import pytest
 from PIL import Image
 
 from gsstream.core.errors import SourceError
+from gsstream.input.prepare.given import read_raw
 from gsstream.input.recordings.detect import detect, read_layout
 from gsstream.input.recordings.open import open_source
+from gsstream.input.recordings.options import DataOptions
 from gsstream.input.recordings.poses import from_rotation_vector, invert
+from gsstream.input.recordings.transformed import transformed
+from tests.input.recordings.scenes import write_video
 
 WIDTH, HEIGHT = 96, 64
 NAMES = ("cam_0", "cam_1", "cam_2")
@@ -232,3 +237,72 @@ def test_two_calibrations_in_one_folder_are_named(tmp_path: Path) -> None:
     qualisys(folder)
     with pytest.raises(SourceError, match=r"several calibrations: .*Calib\.qca\.txt, .*cam_0\.yml"):
         read_layout("calibrated", folder)
+
+
+def declared(folder: Path, count: int | None = None, **more: Any) -> None:
+    """cameras.json beside videos, as a program of one's own writes it: of two frames, the first those of pictures()."""
+    K = [[FX, 0, CX], [0, FY, CY], [0, 0, 1]]
+    cameras = []
+    for i, (name, pose) in enumerate(zip(NAMES, poses(), strict=True)):
+        first = np.random.default_rng(i).integers(0, 255, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+        write_video(folder / f"{name}.mkv", np.stack([first, first[::-1]]))
+        entry = {"id": name, "width": WIDTH, "height": HEIGHT, "K": K, "w2c": pose.tolist(), "frames": f"{name}.mkv"}
+        cameras.append(entry | {"distortion": list(DISTORTION)} | more)
+    data = {"cameras": cameras} if count is None else {"frames": count, "cameras": cameras}
+    (folder / "cameras.json").write_text(json.dumps(data))
+
+
+def test_cameras_json_takes_videos_and_lenses_without_naming_its_schema(tmp_path: Path) -> None:
+    """Against the same rig as Anipose writes it, with the pictures as files."""
+    pytest.importorskip("av")
+    pictures(reference := tmp_path / "rig")
+    toml(reference, True)
+    declared(folder := tmp_path / "own")
+    np.savez(folder / "points_frame0.npz", xyz=np.zeros((2, 3)), rgb=np.zeros((2, 3), np.uint8))
+    source, expected = open_source(str(folder)), open_source(str(reference))
+    assert source.info.num_frames == 2
+    assert np.allclose(source.info.train.Ks, expected.info.train.Ks, atol=1e-9)
+    assert np.abs(source.frame(0).images - expected.frame(0).images).max() < 1e-6
+    assert np.abs(source.frame(1).images - expected.frame(0).images).max() > 0.1
+    held = transformed(source, DataOptions(test_cameras=(NAMES[0],)))
+    assert (len(source.points() or ()), held.points()) == (2, None), "nobody says that it took no part in them"
+    (_, raw, rig), (_, _, known) = read_raw(str(folder)), read_raw(str(reference))
+    assert rig is not None
+    assert known is not None
+    for got, wanted in zip(rig.lenses, known.lenses, strict=True):
+        assert got.model == wanted.model
+        assert np.allclose(got.params, wanted.params)
+    assert [len(list(camera.frames(None))) for camera in raw] == [2, 2, 2]
+    declared(folder, 1)
+    assert open_source(str(folder)).info.num_frames == 1
+
+
+@pytest.mark.parametrize(
+    ("count", "more", "message"),
+    [
+        (3, {}, r"cam_0\.mkv: 3 frames are declared, the video holds 2"),
+        (2, {"distortion": [0.1]}, "expected 0, 4, 5 or 8 coefficients"),
+        (2, {"fisheye": True}, "expected 4 coefficients of a fisheye"),
+        (2, {"distortion": "none"}, "must be a list of numbers"),
+        (2, {"frames": "no.mp4"}, "camera 'cam_0' has no video"),
+        (2, {"width": WIDTH + 1}, rf"pictures of camera 'cam_0' are {WIDTH} x {HEIGHT} pixels"),
+    ],
+)
+def test_videos_and_lenses_that_do_not_fit_are_named(
+    tmp_path: Path, count: int, more: dict[str, Any], message: str
+) -> None:
+    pytest.importorskip("av")
+    declared(tmp_path, count, **more)
+    with pytest.raises(SourceError, match=message):
+        open_source(str(tmp_path))
+
+
+def test_a_growing_recording_takes_neither(tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    declared(tmp_path)
+    with pytest.raises(SourceError, match="names a single video; a growing recording needs a pattern"):
+        open_source(f"watch:{tmp_path}")
+    text = (tmp_path / "cameras.json").read_text().replace(".mkv", "/%d.png")
+    (tmp_path / "cameras.json").write_text(text)
+    with pytest.raises(SourceError, match="has 'distortion'; a growing recording needs pictures of a pinhole"):
+        open_source(f"watch:{tmp_path}")

@@ -121,7 +121,12 @@ def all_test(data: dict[str, Any]) -> None:
 
 
 FAULTS: dict[str, tuple[Edit, str]] = {
-    "schema": (lambda d: d.update(schema="nerf"), 'expected "schema": "opencv-multiview-1", got \'nerf\''),
+    "schema": (
+        lambda d: d.update(schema="nerf"),
+        r'expected \{"schema": "opencv-multiview-1", "frames": .*got "schema": \'nerf\'; .*scene-formats\.md',
+    ),
+    "another file": (lambda d: (d.clear(), d.update(frames=[])), r"got the keys \['frames'\]"),
+    "no pose": (lambda d: d["cameras"][1].pop("w2c"), r"camera 'cam1' has no 'w2c'; give the 4 x 4 matrix \(world to"),
     "no frames key": (set_camera(1, frames=None), "camera 'cam1' has no frames"),
     "two conversions": (set_camera(1, frames="cam1/%d%d.png"), "one integer conversion"),
     "escape": (set_camera(1, frames="../%04d.png"), "must stay inside"),

@@ -17,7 +17,7 @@ def export(
     out: Annotated[Path, typer.Option("--out", help="Folder for the files.")],
     kind: Annotated[
         Literal["ply", "spz", "sequence", "manifest", "page"],
-        typer.Option("--format", help="3DGS PLYs, SPZs (by splat-transform), PLYs with a list, or for the web."),
+        typer.Option("--format", help="3DGS PLYs, SPZs, PLYs with a list, or for the web."),
     ] = "ply",
     frames: Frames = None,
     max_memory: MaxMemory = None,

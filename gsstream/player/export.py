@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,16 +12,12 @@ from typing import Literal
 import numpy as np
 
 from gsstream.core.errors import InputError, OutputError
-from gsstream.core.gaussians import Gaussians
-from gsstream.core.shapes import FloatArray
 from gsstream.core.world import IDENTITY, World
 from gsstream.player.playback import Playback
 from gsstream.player.ply import write_ply
+from gsstream.player.spz import spz_bytes
 
 FORMATS = ("ply", "spz", "sequence")
-#: Where the converter is looked for: this variable, then the path.
-CONVERTER_VARIABLE = "GSSTREAM_SPLAT_TRANSFORM"
-_CONVERTER = "splat-transform"
 
 
 def export(
@@ -38,23 +31,21 @@ def export(
         stream: file to read.
         out: folder to write.
         progress: called with (files written, files in all).
-        kind: ``ply``; ``spz`` (through splat-transform, an npm package); ``sequence``: PLYs and ``sequence.json`` with
-            frame indices, times and the cameras.
+        kind: ``ply``; ``spz``; ``sequence``: PLYs and ``sequence.json`` with frame indices, times and the cameras.
         frames: frame indices; default: all up to the first damaged packet.
         max_memory: bytes that decoding a frame may take at most; default: what the format allows.
         origin: ``recording``: the recording's coordinates; ``local``: the same axes and unit, but positions relative
             to the world's offset, which ``sequence.json`` and the headers of the PLYs state. The files hold float32,
             which is too coarse for a scene far from the recording's origin.
 
-    Raises InputError for an unknown format or frame, for positions that float32 cannot hold and beyond ``max_memory``,
+    Raises InputError for an unknown format or frame, for what the format cannot hold and beyond ``max_memory``,
     PacketError for a damaged stream (without ``frames``: once the files before the damage are written), OutputError
-    when the folder cannot be written or the converter is missing or fails.
+    when the folder cannot be written.
     """
     if kind not in FORMATS:
         raise InputError(f"cannot export to {kind!r}: expected one of {', '.join(FORMATS)}")
     if Path(out).suffix.lower() in (".ply", ".spz", ".json") and not Path(out).is_dir():
         raise OutputError(f"{out}: expected a folder, which holds one file per frame, got the name of a file")
-    converter = find_converter() if kind == "spz" else ""
     folder, written = Path(out), []
     with Playback(stream, max_memory=max_memory) as playback:
         sound, damage = playback.sound() if frames is None else (frames, None)
@@ -67,10 +58,11 @@ def export(
             folder.mkdir(parents=True, exist_ok=True)
             for done, frame in enumerate(chosen, 1):
                 file = folder / f"{frame:06d}.{'spz' if kind == 'spz' else 'ply'}"
-                if converter:
-                    _write_spz(file, world.gaussians(playback.state_at(frame)), converter)
+                scene = world.gaussians(playback.state_at(frame))
+                if kind == "spz":
+                    file.write_bytes(spz_bytes(scene))
                 else:
-                    write_ply(file, world.gaussians(playback.state_at(frame)), comments)
+                    write_ply(file, scene, comments)
                 written.append(file)
                 if progress is not None:
                     progress(done, len(chosen))
@@ -81,19 +73,6 @@ def export(
     if damage is not None:
         raise damage
     return written
-
-
-def find_converter() -> str:
-    """Find the splat-transform program. Raises OutputError that says how to get it."""
-    named = os.environ.get(CONVERTER_VARIABLE)
-    found = shutil.which(named or _CONVERTER)
-    if found is None:
-        where = f"{CONVERTER_VARIABLE} names {named!r}, which is no program" if named else f"{_CONVERTER} is not found"
-        raise OutputError(
-            f"SPZ is written through the npm package @playcanvas/splat-transform, and {where}; install it "
-            f"(npm install -g @playcanvas/splat-transform), or set {CONVERTER_VARIABLE} to the program, or export ply"
-        )
-    return found
 
 
 def _world_of_files(playback: Playback, frames: Sequence[int], origin: str) -> World:
@@ -115,18 +94,6 @@ def _world_of_files(playback: Playback, frames: Sequence[int], origin: str) -> W
             f"({', '.join(f'{value:.6g}' for value in world.offset)}) by --origin local"
         )
     return world
-
-
-def _write_spz(file: Path, scene: Gaussians[FloatArray], converter: str) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        plain = Path(folder) / "frame.ply"
-        write_ply(plain, scene)
-        done = subprocess.run(
-            [converter, "--overwrite", str(plain), str(file)], capture_output=True, text=True, check=False
-        )
-    if done.returncode != 0 or not file.is_file():
-        tail = (done.stderr or done.stdout).strip().splitlines()[-3:]
-        raise OutputError(f"{converter} could not write {file} (exit code {done.returncode}): {' '.join(tail)}")
 
 
 def _description(playback: Playback, frames: Sequence[int], world: World) -> str:

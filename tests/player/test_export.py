@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
 import json
-import os
 import shutil
 import struct
 import subprocess
@@ -15,11 +15,12 @@ from test_player import make_scene, make_stream
 from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError, OutputError
 from gsstream.core.world import World
-from gsstream.player.export import CONVERTER_VARIABLE, export
+from gsstream.player.export import export
 from gsstream.player.playback import Playback
 from gsstream.player.ply import ply_bytes
+from gsstream.player.spz import spz_bytes
 
-CONVERTER = shutil.which(os.environ.get(CONVERTER_VARIABLE, "splat-transform"))
+CONVERTER = shutil.which("splat-transform")
 needs_converter = pytest.mark.skipif(
     CONVERTER is None, reason="no splat-transform (npm install @playcanvas/splat-transform)"
 )
@@ -83,22 +84,21 @@ def test_sequence_names_files_times_and_cameras(tmp_path):
             assert np.array_equal(columns(read_ply(file.read_bytes()), "x", "y", "z"), playback.state_at(frame).means)
 
 
-def test_mistakes_of_an_export_are_named(tmp_path, monkeypatch):
+def test_mistakes_of_an_export_are_named(tmp_path):
     stream = make_stream(tmp_path / "s.gss", 2)
     with pytest.raises(InputError, match="expected one of ply, spz, sequence"):
         export(stream, tmp_path / "out", "glb")
     with pytest.raises(InputError, match="frame 2"):
         export(stream, tmp_path / "out", "ply", frames=[2])
-    monkeypatch.setenv(CONVERTER_VARIABLE, str(tmp_path / "no-program"))
-    with pytest.raises(OutputError, match=r"npm package @playcanvas/splat-transform.*names .*no-program"):
-        export(stream, tmp_path / "out", "spz")
     assert not (tmp_path / "out").exists()
-    failing = tmp_path / "failing"
-    failing.write_text("#!/bin/sh\necho broken converter >&2\nexit 3\n")
-    failing.chmod(0o755)
-    monkeypatch.setenv(CONVERTER_VARIABLE, str(failing))
-    with pytest.raises(OutputError, match=r"exit code 3.*broken converter"):
-        export(stream, tmp_path / "out", "spz")
+    scene = make_scene(0, 5)
+    scene.scales[2, 1] = 6
+    with pytest.raises(InputError, match=r"scales up to 379 units, and 1 of 5 .* export ply"):
+        spz_bytes(scene)
+    scene = make_scene(0, 5)
+    scene.means[2, 1] = -1e7
+    with pytest.raises(InputError, match=r"positions up to 8388607, got 1e\+07: .*--origin local"):
+        spz_bytes(scene)
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="cannot write"):
         export(stream, tmp_path / "file", "ply")
@@ -163,22 +163,69 @@ def test_splat_transform_reads_our_ply(tmp_path):
     assert np.array_equal(columns(found, "opacity")[:, 0], scene.opacities)
 
 
+#: Signs of y, z, x; xy, yz, 3zz - 1, xz, xx - yy; y, xyz, y, z, x, z, x (times what is even) where y and z turn.
+HALF_TURN = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
+
+
+def read_spz(data: bytes) -> dict[str, np.ndarray]:
+    """The Gaussians of an SPZ of version 3, byte by byte as its description says, turned to the axes of a PLY."""
+    data = gzip.decompress(data)
+    magic, version, number, degree, bits, flags, reserved = struct.unpack_from("<4sIIBBBB", data)
+    assert (magic, version, flags, reserved) == (b"NGSP", 3, 0, 0)
+    at, rows = 16, range(number)
+
+    def take(width: int) -> list[bytes]:
+        nonlocal at
+        at += width * number
+        return [data[at - width * (number - i) : at - width * (number - i - 1)] for i in rows]
+
+    steps = [[int.from_bytes(row[i : i + 3], "little", signed=True) for i in (0, 3, 6)] for row in take(9)]
+    means = [[x / 2**bits, -y / 2**bits, -z / 2**bits] for x, y, z in steps]
+    alphas = [row[0] / 255 for row in take(1)]
+    colors = [[(byte / 255 - 0.5) / 0.15 for byte in row] for row in take(3)]
+    scales = [[byte / 16 - 10 for byte in row] for row in take(3)]
+    quats = []
+    for (packed,) in map(struct.Struct("<I").unpack, take(4)):
+        others = [(packed >> shift) & 1023 for shift in (20, 10, 0)]
+        parts = [(-1) ** (part >> 9) * (part & 511) / 511 * 2**-0.5 for part in others]
+        parts.insert(packed >> 30, max(0.0, 1 - sum(part**2 for part in parts)) ** 0.5)
+        quats.append([parts[3], parts[0], -parts[1], -parts[2]])
+    rest = (degree + 1) ** 2 - 1
+    shN = [[HALF_TURN[i // 3] * (byte - 128) / 128 for i, byte in enumerate(row)] for row in take(3 * rest)]
+    assert at == len(data)
+    found = {"means": means, "alphas": alphas, "colors": colors, "scales": scales, "quats": quats, "shN": shN}
+    return {name: np.array(values) for name, values in found.items()}
+
+
+@pytest.mark.parametrize("sh_rest", [0, 3, 8, 15])
+@pytest.mark.parametrize("spread", [1e-3, 0.6, 500.0])
+def test_spz_is_the_scene_to_its_precision(sh_rest, spread):
+    scene = make_scene(4, 200, sh_rest, spread)
+    scene.quats[:4] = np.eye(4)
+    scene.scales[0] = -15
+    found = read_spz(spz_bytes(scene))
+    assert np.abs(found["means"] - scene.means).max() <= 2.0**-22 * np.abs(scene.means).max()
+    assert np.abs(found["alphas"] - 1 / (1 + np.exp(-scene.opacities.astype(float)))).max() < 0.501 / 255
+    assert np.abs(found["colors"] - np.clip(scene.sh0[:, 0], -1 / 0.3, 1 / 0.3)).max() < 0.501 / 255 / 0.15
+    assert np.abs(found["scales"] - np.maximum(scene.scales, -10)).max() < 0.501 / 16
+    cosine = np.abs((found["quats"] * scene.quats).sum(1)) / np.linalg.norm(scene.quats, axis=1)
+    assert cosine.min() > 1 - 1e-5
+    steps = np.where(np.arange(3 * sh_rest) < 9, 4.5, 8.5) / 128
+    assert (np.abs(found["shN"] - scene.shN.reshape(200, -1)) <= steps).all()
+    assert read_spz(spz_bytes(make_scene(0, 0, sh_rest)))["means"].size == 0
+
+
 @needs_converter
-def test_spz_read_back_is_the_scene_to_its_precision(tmp_path):
+def test_splat_transform_reads_our_spz_as_we_do(tmp_path):
     stream = make_stream(tmp_path / "s.gss", 2)
     (file,) = export(stream, tmp_path / "out", "spz", frames=[1])
-    assert file.read_bytes()[:4] != b"ply\n"
     subprocess.run([CONVERTER, "--overwrite", str(file), str(tmp_path / "b.ply")], check=True, capture_output=True)
-    found = read_ply((tmp_path / "b.ply").read_bytes())
-    with Playback(stream) as playback:
-        scene = playback.state_at(1)
-    back = columns(found, "x", "y", "z")
-    # The writer may store Gaussians in another order.
-    nearest = np.linalg.norm(back[None] - scene.means[:, None], axis=2).argmin(1)
-    assert len(set(nearest.tolist())) == len(scene)
-    assert np.abs(back[nearest] - scene.means).max() < 1e-3
-    scales = columns(found, "scale_0", "scale_1", "scale_2")[nearest]
-    assert np.abs(scales - np.clip(scene.scales, -10, 6)).max() < 0.07
-    quats = columns(found, *(f"rot_{i}" for i in range(4)))[nearest]
-    cosine = np.abs((quats * scene.quats).sum(1)) / np.linalg.norm(quats, axis=1) / np.linalg.norm(scene.quats, axis=1)
-    assert cosine.min() > 0.999
+    theirs, ours = read_ply((tmp_path / "b.ply").read_bytes()), read_spz(file.read_bytes())
+    assert columns(theirs, "x", "y", "z") == pytest.approx(ours["means"], abs=1e-6)
+    assert columns(theirs, "scale_0", "scale_1", "scale_2") == pytest.approx(ours["scales"], abs=1e-6)
+    assert columns(theirs, *(f"f_dc_{i}" for i in range(3))) == pytest.approx(ours["colors"], abs=1e-6)
+    quats = columns(theirs, *(f"rot_{i}" for i in range(4)))
+    assert np.abs((quats * ours["quats"]).sum(1)).min() > 1 - 1e-6
+    number, rest = len(quats), ours["shN"].shape[1] // 3
+    shN = columns(theirs, *(f"f_rest_{i}" for i in range(3 * rest))).reshape(number, 3, rest).transpose(0, 2, 1)
+    assert shN.reshape(number, -1) == pytest.approx(ours["shN"], abs=1e-6)

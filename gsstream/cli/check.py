@@ -15,15 +15,23 @@ if TYPE_CHECKING:
     from gsstream.testing.kit import CheckResult
 
 MARKS = {"passed": "✓", "failed": "✗", "warning": "⚠", "expected failure": "⚠", "skipped": "⚠"}
+#: Kinds whose parts keep every promise and may still spoil the picture.
+MEASURED = ("motion", "growth")
 
 
 @dataclass(frozen=True)
 class Subject:
-    """One thing that was checked. ``absent``: it cannot be made on this machine, so that nothing could be checked."""
+    """One thing that was checked.
+
+    Arguments:
+        absent: it cannot be made on this machine, so that nothing could be checked.
+        effect: what it does to a tiny recording.
+    """
 
     heading: str
     results: list[CheckResult]
     absent: bool = False
+    effect: str = ""
 
 
 def check(
@@ -49,6 +57,8 @@ def check(
         typer.echo(subject.heading)
         for line in _lines(subject, quiet):
             typer.echo(line)
+        if subject.effect and not quiet:
+            typer.echo(f"  {subject.effect}")
         typer.echo(f"  {summary(subject.results)}")
         subjects.append(subject)
     everything = [result for subject in subjects for result in subject.results]
@@ -107,6 +117,7 @@ def _subjects(catalog: Catalog, name: str, source: str | None, settings: list[st
         skip_checks,
     )
     from gsstream.testing.recording import SourceUnderTest
+    from gsstream.testing.working import effect
 
     if name == "packets":
         yield Subject("packet format", run_packet_checks())
@@ -130,7 +141,9 @@ def _subjects(catalog: Catalog, name: str, source: str | None, settings: list[st
             except PluginUnavailable as error:
                 yield Subject(heading, skip_checks(kind, part, str(error)), absent=True)
             else:
-                yield Subject(heading, run_checks(built))
+                results = run_checks(built)
+                sound = kind in MEASURED and all(result.ok for result in results)
+                yield Subject(heading, results, effect=effect(kind, built) if sound else "")
 
 
 def _config(cls: type[Any], settings: list[str]) -> Any:

@@ -6,6 +6,7 @@ import functools
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
 from gsstream.core.changes import Scene
@@ -16,7 +17,9 @@ from gsstream.engine.step.active.change import Change, detect_changed_tiles
 from gsstream.engine.step.context import EngineContext
 from gsstream.input.recordings.open import open_source
 from gsstream.method.base import Step
-from gsstream.testing.method_driver import SOURCE, MethodUnderTest
+from gsstream.metrics.psnr import psnr
+from gsstream.player.render import named_renderer, render
+from gsstream.testing.method_driver import FRAMES, SOURCE, MethodUnderTest
 
 #: Sigmas beyond which tiles count as changed.
 THRESHOLD = 6.0
@@ -62,6 +65,22 @@ def method_with(slot: str, part: Part) -> MethodUnderTest:
     changed: dict[str, Any] = {slot: part}
     method.parts = replace(method.parts, **changed)
     return method
+
+
+def effect(slot: str, part: Part) -> str:
+    """Return in words what a part does to a tiny recording: no promise, but a part that spoils it is seen."""
+    test = open_source(SOURCE).frame(FRAMES - 1, "test")
+    quality, kilobytes = [], []
+    for method in (method_with(slot, part), MethodUnderTest("dense")):
+        steps = method.chain()
+        image = render(steps[-1].state.player.gaussians, test.cameras, renderer=named_renderer("numpy"))
+        quality.append(psnr(np.clip(image, 0, 1), test.images[0]))
+        kilobytes.append(np.mean([len(step.packet.data) for step in steps[1:]]) / 1e3)
+    pixels = f"{test.cameras.width} x {test.cameras.height} pixels"
+    return (
+        f"frame {FRAMES - 1} of a recording of {pixels}, with it and without: {quality[0]:.1f} / {quality[1]:.1f} dB "
+        f"in the test camera, {kilobytes[0]:.1f} / {kilobytes[1]:.1f} KB a frame"
+    )
 
 
 def check_closed_loop(slot: str, part: Part) -> None:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import final
 
+import numpy as np
 import pytest
 
+from gsstream.api import FitContext, Growth, Rng, RowEdit, Scene
 from gsstream.cli.check import Subject, _lines
 from gsstream.cli.main import run_command
 from gsstream.testing.kit import CheckResult
+from gsstream.testing.working import effect
 
 BROKEN = '''
 from typing import final
@@ -95,6 +100,27 @@ def test_settings_of_the_part_that_is_checked(capsys: pytest.CaptureFixture[str]
     assert "logits" in capsys.readouterr().err
     assert run_command(["check", "reference", "--set", "x=1"]) == 2
     assert "--set gives settings to one part" in capsys.readouterr().err
+
+
+@final
+class Thinning(Growth):
+    """Half of the Gaussians leave in every frame: no check forbids it."""
+
+    source = "this test"
+
+    def propose(self, after: Scene, work: FitContext, rng: Rng) -> RowEdit | None:
+        return RowEdit(removed=np.arange(0, len(after.gaussians), 2))
+
+
+def test_a_part_that_keeps_its_promises_and_spoils_the_picture_is_seen(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["check", "growth/none"]) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "with it and without" in line]
+    numbers = r"([\d.]+) / ([\d.]+) dB in the test camera, ([\d.]+) / ([\d.]+) KB a frame"
+    same = [float(number) for number in re.findall(numbers, line)[0]]
+    assert (same[0], same[2]) == (same[1], same[3]), "the null part changes nothing"
+    spoiled, without, *_ = map(float, re.findall(numbers, effect("growth", Thinning(Thinning.Config())))[0])
+    assert without == same[1]
+    assert spoiled < without - 0.5
 
 
 def test_one_cause_is_told_once(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 Each gets a source archive and the wheel that is built from it, beside a list of their checksums. The same sources give
 the same bytes: times are those of the commit, and ``dist_constraints.txt`` pins what builds. ``--twice`` proves it.
+``--aarch64`` adds the renderer's wheel for that family of processors (needs ``apt install g++-aarch64-linux-gnu``).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import hashlib
 import os
 import subprocess
 import sys
+import sysconfig
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,6 +20,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PINS = Path(__file__).with_name("dist_constraints.txt")
 SUMS = "SHA256SUMS"
+RENDERER = ROOT / "plugins" / "cpu_render"
 
 
 def projects() -> list[Path]:
@@ -34,8 +37,25 @@ def source_date() -> str:
     return subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
 
 
-def build(out: Path, chosen: Sequence[Path], *, isolated: bool = True) -> dict[str, str]:
+def for_aarch64() -> dict[str, str]:
+    """Return what makes a build of the renderer, on x86-64 Linux, one for aarch64 and this version of Python."""
+    suffix = sysconfig.get_config_var("EXT_SUFFIX")
+    return {
+        "CXX": "aarch64-linux-gnu-g++",
+        "CMAKE_ARGS": "-DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64",
+        "SETUPTOOLS_EXT_SUFFIX": suffix.replace("x86_64", "aarch64"),
+        "_PYTHON_HOST_PLATFORM": "linux-aarch64",
+    }
+
+
+def build(out: Path, chosen: Sequence[Path], *, isolated: bool = True, aarch64: bool = False) -> dict[str, str]:
     """Build distributions into a folder.
+
+    Arguments:
+        out: new or empty.
+        chosen: folders of distributions.
+        isolated: each is built in an environment of its own.
+        aarch64: the renderer's wheel for aarch64 is built, too.
 
     Returns file name -> SHA-256 of all that was built; ``out`` has them as ``SHA256SUMS`` too.
 
@@ -47,11 +67,13 @@ def build(out: Path, chosen: Sequence[Path], *, isolated: bool = True) -> dict[s
     if ROOT in chosen:  # the archives of gsstream hold the pages that are made from its code
         subprocess.run([sys.executable, "-m", "tools.reference"], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
     environment = {**os.environ, "SOURCE_DATE_EPOCH": source_date(), "PIP_CONSTRAINT": str(PINS)}
-    for project in chosen:
-        print(f"== {project.relative_to(ROOT)}", flush=True)
-        command = [sys.executable, "-m", "build", "--outdir", str(out.resolve()), str(project)]
+    jobs: list[tuple[Path, dict[str, str], list[str]]] = [(project, {}, []) for project in chosen]
+    jobs += [(RENDERER, for_aarch64(), ["--wheel"])] if aarch64 else []
+    for project, more, options in jobs:
+        print(f"== {project.relative_to(ROOT)} {'for aarch64' if more else ''}".rstrip(), flush=True)
+        command = [sys.executable, "-m", "build", "--outdir", str(out.resolve()), str(project), *options]
         command += [] if isolated else ["--no-isolation"]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        done = subprocess.run(command, env=environment | more, capture_output=True, text=True, check=False)
         if done.returncode:
             print(done.stdout + done.stderr, file=sys.stderr)
             done.check_returncode()
@@ -66,16 +88,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder, new or empty (default: dist)")
     parser.add_argument("--only", action="append", choices=names, help="gsstream or the folder of a plugin; repeatable")
+    parser.add_argument("--aarch64", action="store_true", help="and the renderer's wheel for aarch64")
     parser.add_argument("--twice", action="store_true", help="build a second time and compare every byte")
     options = parser.parse_args(argv)
     chosen = [names[name] for name in options.only or names]
-    first = build(options.out, chosen)
+    first = build(options.out, chosen, aarch64=options.aarch64)
     for name in first:
         print(f"{(options.out / name).stat().st_size:>10}  {name}")
     if not options.twice:
         return 0
     with tempfile.TemporaryDirectory() as folder:
-        second = build(Path(folder), chosen)
+        second = build(Path(folder), chosen, aarch64=options.aarch64)
     differing = sorted(name for name in first.keys() | second.keys() if first.get(name) != second.get(name))
     print(f"built twice: {len(first) - len(differing)} of {len(first)} archives have equal bytes")
     for name in differing:

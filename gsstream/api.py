@@ -50,6 +50,7 @@ from gsstream.core.part import Part as Part
 from gsstream.core.part import PartConfig as PartConfig
 from gsstream.core.part import Traits as Traits
 from gsstream.core.part import unwrapped as unwrapped
+from gsstream.core.picture_size import is_large as is_large
 from gsstream.core.rng import Rng as Rng
 from gsstream.core.shapes import FloatArray as FloatArray
 from gsstream.core.shapes import IntArray as IntArray
@@ -78,6 +79,7 @@ from gsstream.parts.gate.base import GateTraits as GateTraits
 from gsstream.parts.gate.base import SampledGate as SampledGate
 from gsstream.parts.growth.base import Growth as Growth
 from gsstream.parts.loss.base import Loss as Loss
+from gsstream.parts.loss.base import LossTraits as LossTraits
 from gsstream.parts.motion.base import MotionPart as MotionPart
 from gsstream.parts.optimiser.base import ADAM_BETAS as ADAM_BETAS
 from gsstream.parts.optimiser.base import ADAM_EPS as ADAM_EPS

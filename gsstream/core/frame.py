@@ -10,6 +10,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import FloatArray, as_array, check_shape
+from gsstream.core.storage import unpacked
 
 #: How far outside [0, 1] an image may be: the rounding error of resampling in float32.
 ROUNDING = 1e-4
@@ -36,7 +37,8 @@ class Frame:
     Arguments:
         index: position in the stream, from 0; a stream may begin later.
         timestamp: seconds since the first frame.
-        images: [C, H, W, 3] float32 in [0, 1].
+        images: [C, H, W, 3] float32 in [0, 1], as a source reads them, or as they are stored: uint8 of which 255 is
+            1.0. :meth:`image` gives float32 of either.
         cameras: the C cameras, in the order of ``images``.
         epoch_scale: share of the recipe's epochs that this frame is worth, in [0, 1]. A live source lowers it when the
             run falls behind; 0 asks for an empty packet, so that numbering and time go on. Frame 0 is always done in
@@ -51,22 +53,29 @@ class Frame:
     epoch_scale: float = 1.0
     arrival: Arrival | None = None
 
-    def as_float32(self) -> Frame:
-        """Return the frame with images of float32; those of uint8, whose white is 255, and of float64 are converted.
+    def image(self, view: int) -> FloatArray:
+        """Return [H, W, 3] float32 in [0, 1]: what a camera recorded."""
+        return unpacked(self.images[view])
 
-        A warning says so once. Raises ShapeError for images of another type.
+    def as_float32(self) -> Frame:
+        """Return the frame with images of float32, in four times the memory where they are stored as uint8."""
+        return self if self.images.dtype == np.float32 else replace(self, images=unpacked(self.images))
+
+    def as_stored(self) -> Frame:
+        """Return the frame with images of float32 or uint8; those of float64 are converted, and a warning says so once.
+
+        Raises ShapeError for images of another type.
         """
         images = as_array("images", self.images)
-        if images.dtype == np.float32:
+        if images.dtype in (np.float32, np.uint8):
             return self if images is self.images else replace(self, images=images)
-        if images.dtype not in (np.uint8, np.float64):
+        if images.dtype != np.float64:
             raise ShapeError(
                 f"images of frame {self.index}: expected float32 in [0, 1], float64 or uint8, got {images.dtype}; "
                 "divide them by the value that means white"
             )
         warnings.warn(f"images of {images.dtype} are converted to float32 in [0, 1]", stacklevel=3)
-        white = 255 if images.dtype == np.uint8 else 1
-        return replace(self, images=images.astype(np.float32) / np.float32(white))
+        return replace(self, images=images.astype(np.float32))
 
     def validate(self) -> None:
         """Raise ShapeError when images disagree with the cameras, or hold a value that no image may have.
@@ -74,6 +83,8 @@ class Frame:
         The message names camera, frame and first pixel of a value that is not finite or outside [0, 1].
         """
         check_shape("images", self.images, (len(self.cameras), self.cameras.height, self.cameras.width, 3))
+        if self.images.dtype == np.uint8:
+            return
         for camera, image in zip(self.cameras.ids, self.images, strict=True):
             # Least and largest value are NaN when any pixel is, and comparing with NaN gives false.
             if image.size and not (float(image.min()) >= -ROUNDING and float(image.max()) <= 1 + ROUNDING):
@@ -96,8 +107,10 @@ def shrink_frame(frame: Frame, factor: int) -> Frame:
         return frame
     cameras = frame.cameras
     height, width = cameras.height // factor, cameras.width // factor
-    cut = frame.images[:, : height * factor, : width * factor]
-    images = cut.reshape(len(cameras), height, factor, width, factor, 3).mean((2, 4), dtype=np.float32)
+    images = np.empty((len(cameras), height, width, 3), np.float32)
+    for view, out in enumerate(images):
+        cut = frame.image(view)[: height * factor, : width * factor]
+        cut.reshape(height, factor, width, factor, 3).mean((1, 3), dtype=np.float32, out=out)
     # The crop keeps the image corner, so only the size changes before the scale does.
     cameras = replace(cameras, width=width * factor, height=height * factor).scaled(width, height)
     return replace(frame, images=images, cameras=cameras)

@@ -12,8 +12,14 @@ import math
 
 #: Width, and number of pixels, of the pictures for which settings are given.
 WIDTH, PIXELS = 320, 320 * 240
-#: Width from which a picture is large: what lies away from a change is then told without its pixels.
+#: Width from which a picture is large: what lies away from a change is then told without its pixels, and what a loss
+#: keeps of its target may be rounded to 16 bits.
 LARGE = 960
+
+
+def is_large(width: int) -> bool:
+    """Return whether a picture is so large that memory and time count for more than its last digits."""
+    return width >= LARGE
 
 
 def enlargement(width: int) -> float:

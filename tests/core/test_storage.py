@@ -67,6 +67,9 @@ def test_frames_wait_packed_and_come_as_the_source_gives_them() -> None:
         waiting = frames._pending[0].result()
         assert waiting[0].images.dtype == np.dtype("uint8")
         for index, (train, test) in zip(itertools.count(), frames, strict=False):
-            assert train.images.tobytes() == source.frame(index).images.tobytes()
-            assert 0 < np.abs(train.images - plain.frame(index).images).max() <= ERROR["uint8"]
+            assert train.images.dtype == np.dtype("uint8")
+            floats = train.as_float32().images
+            assert floats.tobytes() == source.frame(index).images.tobytes()
+            assert floats[1].tobytes() == train.image(1).tobytes()
+            assert 0 < np.abs(floats - plain.frame(index).images).max() <= ERROR["uint8"]
             assert test.images.tobytes() == plain.frame(index, "test").images.tobytes()

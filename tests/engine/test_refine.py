@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from gsstream.api import LossTraits
 from gsstream.core.changes import AddedGaussians, Delta, Layout, RowEdit, Scene
 from gsstream.core.errors import ComponentError
 from gsstream.core.frame import Frame
@@ -136,6 +137,7 @@ class Broken:
         raise RuntimeError("out of order")
 
     evaluate = prepare
+    claims = LossTraits
 
 
 def test_a_refinement_that_fails_leaves_the_encoder_as_it_was() -> None:

@@ -24,6 +24,10 @@ class FrameImages:
     def __len__(self) -> int:
         return len(self._images)
 
+    def stored(self, view: int) -> torch.Tensor:
+        """Return [H, W, 3] as it is stored, float32 or uint8, where it is worked on by the processor; else float32."""
+        return torch.from_numpy(self._images[view]) if self.device.type == "cpu" else self[view]
+
     def __getitem__(self, view: int) -> torch.Tensor:
         if self.device.type == "cpu":
             return torch.from_numpy(unpacked(self._images[view]))

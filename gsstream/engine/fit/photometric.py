@@ -28,13 +28,14 @@ class PhotometricLoss:
         self, loss: Loss, dssim: float, images: FrameImages, exposure: Exposure | None
     ) -> None:
         self._loss, self._dssim, self.images, self.exposure = loss, dssim, images, exposure
+        self._takes_bytes = loss.claims().takes_bytes
         self._prepared: dict[int, Any] = {}
 
     def view_target(self, view: int, tile_weights: torch.Tensor | None = None) -> ViewTarget:
         """Return what renders of a view are compared with."""
-        image = self.images[view]
+        image = self.images.stored(view)
         if view not in self._prepared:
-            self._prepared[view] = self._loss.prepare(image)
+            self._prepared[view] = self._loss.prepare(image if self._takes_bytes else self.images[view])
         exposure = self.exposure[view] if self.exposure else None
         return ViewTarget(self._loss, self._prepared[view], self._dssim, image, exposure, tile_weights)
 

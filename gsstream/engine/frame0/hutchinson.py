@@ -37,7 +37,7 @@ class TrainingViews:
 
     def error(self, view: int, image: torch.Tensor) -> float:
         """Return the mean squared error of what a camera would record [H, W, 3]."""
-        return float((image - torch.from_numpy(self.frame.images[view]).to(image.device)).square().mean())
+        return float((image - torch.from_numpy(self.frame.image(view)).to(image.device)).square().mean())
 
 
 class HutchinsonSample(NamedTuple):

@@ -20,7 +20,7 @@ def with_shell(
     start: Gaussians[torch.Tensor], levels: torch.Tensor, frame: Frame
 ) -> tuple[Gaussians[torch.Tensor], torch.Tensor]:
     """Return the Gaussians and their levels with those of the shell behind them, which have the coarsest level."""
-    points = shell_points(frame.images, frame.cameras)
+    points = shell_points(frame.as_float32().images, frame.cameras)
     scales = torch.full((len(points),), math.log(find_shell(frame.cameras).sigma))
     positions, colors = torch.from_numpy(points.xyz), torch.from_numpy(points.rgb)
     sphere = isotropic(positions, colors, scales, OPACITY, start.shN.shape[1])

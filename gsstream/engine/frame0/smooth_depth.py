@@ -68,7 +68,7 @@ class SmoothDepth:
     def _edge_weights(self, view: int) -> list[torch.Tensor]:
         """What a change of depth along both axes costs from pixel to pixel: less where the image changes, too."""
         if view not in self._edges:
-            image = torch.from_numpy(self._frame.images[view]).permute(2, 0, 1)
+            image = torch.from_numpy(self._frame.image(view)).permute(2, 0, 1)
             half = adaptive_avg_pool2d(image, (self._cameras.height, self._cameras.width))
             weights = [torch.exp(-half.diff(dim=axis + 1).abs().mean(0) / EDGE) for axis in (0, 1)]
             self._edges[view] = [weight.to(self._poses.device) for weight in weights]

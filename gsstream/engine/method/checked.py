@@ -14,6 +14,7 @@ from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.assembly.fault import fault
 from gsstream.engine.assembly.guard import error_context
 from gsstream.engine.frame0.begin import check_cameras
+from gsstream.engine.method.parts import PartsMethod
 from gsstream.engine.step.metrics import log_packet
 from gsstream.method.base import Step, StreamingMethod
 from gsstream.method.tools import Tools
@@ -42,17 +43,17 @@ class Checked(StreamingMethod[Any]):
         name = recipe.streaming_method.name if recipe.streaming_method.name != "parts" else recipe.method
         check_cameras(frame.cameras, method.min_cameras, f"the method {name!r}")
         with self._blaming(frame):
-            step = method.begin(frame, tools)
+            step = method.begin(self._given(frame), tools)
         return self._compared(None, step, frame, tools)
 
     def step(self, state: Any, frame: Frame, tools: Tools) -> Step[Any]:
         with self._blaming(frame):
-            step = self._method.step(state, frame, tools)
+            step = self._method.step(state, self._given(frame), tools)
         return self._compared(state.player, step, frame, tools)
 
     def follow_up(self, state: Any, step: Step[Any], frame: Frame, tools: Tools) -> Step[Any]:
         with self._blaming(frame), tools.log.phase("other"):
-            found = self._method.follow_up(state, step, frame, tools)
+            found = self._method.follow_up(state, step, self._given(frame), tools)
         if found is step:
             return step
         difference = ""
@@ -71,7 +72,11 @@ class Checked(StreamingMethod[Any]):
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> Any:
         with error_context(SLOT, self._method, self._parts.where):
-            return self._method.resume(player, shown, tools)
+            return self._method.resume(player, self._given(shown), tools)
+
+    def _given(self, frame: Frame) -> Frame:
+        """What the method is given: images of float32, as methods expect them, unless it is the engine's own."""
+        return frame if isinstance(self._method, PartsMethod) else frame.as_float32()
 
     def _blaming(self, frame: Frame) -> Any:
         self._parts.where.enter(frame.index)

@@ -13,6 +13,7 @@ from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.log import FrameLog
 from gsstream.core.rng import Rng
+from gsstream.core.storage import packed
 from gsstream.core.world import snap_cameras
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.controller import Controller
@@ -95,15 +96,15 @@ class Encoder:
         """Encode the next frame: the first as a key packet, later ones as the method decides.
 
         Arguments:
-            frame: training images, of float32 or what :meth:`Frame.as_float32` converts; its index follows that of the
-                frame before. The first may have any, and the stream then begins there.
+            frame: training images, of float32, uint8 (255 is 1.0) or what :meth:`Frame.as_stored` converts; its index
+                follows that of the frame before. The first may have any, and the stream then begins there.
 
         Raises:
             ShapeError: images that do not fit the cameras, or values outside [0, 1].
             ComponentError: a part fails and the recipe says ``stream.on_error: raise``. Where it fails in the work that
                 follows a packet, that packet has been handed out; the same frame gives it again.
         """
-        frame = frame.as_float32()
+        frame = frame.as_stored()
         frame.validate()
         if self.state is not None and frame.index != self.state.player.frame + 1:
             expected = self.state.player.frame + 1
@@ -150,7 +151,9 @@ class Encoder:
         )
         self.parts.where.enter(end.player.frame)
         with one_torch_thread():
-            self.state = self.method.resume(end.player, self.with_near_plane(image(end.shown)), tools)
+            shown = self.with_near_plane(image(end.shown))
+            shown = replace(shown, images=packed(shown.images, self.parts.recipe.data.images))
+            self.state = self.method.resume(end.player, shown, tools)
         return end.player.frame
 
     def with_near_plane(self, frame: Frame) -> Frame:
@@ -168,7 +171,7 @@ class Encoder:
 
     def _points(self, frame: Frame) -> PointCloud:
         """What frame 0 starts from: seeds, or the centres of the Gaussians that are taken over."""
-        return self._seeds(frame) if self._first is None else point_cloud_of(self._first)
+        return self._seeds(frame.as_float32()) if self._first is None else point_cloud_of(self._first)
 
     def _background(self, frame: Frame) -> tuple[float, float, float]:
         """The colour behind everything, that of frame 0 from then on; a scene that is taken over brings its own."""
@@ -177,7 +180,7 @@ class Encoder:
         if self._first is not None:
             return self._first.meta.background
         wanted = self.parts.recipe.background
-        return mean_color(frame.images) if wanted == "auto" else wanted
+        return mean_color(frame.as_float32().images) if wanted == "auto" else wanted
 
     def _swept(self, frame: Frame) -> PointCloud:
         return gather_points(lambda _: None, frame, self.parts.recipe.first_frame)

@@ -59,7 +59,7 @@ class HeldOut:
         if not held_out or float(np.mean(held_out)) >= LOW_PSNR_DB:
             return ""
         views = np.unique(np.linspace(0, len(train.cameras) - 1, MAX_TRAIN_VIEWS).round().astype(int))
-        seen = float(np.mean([psnr(self.render(state, train, int(view)), train.images[view]) for view in views]))
+        seen = float(np.mean([psnr(self.render(state, train, int(view)), train.image(view)) for view in views]))
         below = seen - float(np.mean(held_out))
         if below < MAX_DROP_DB:
             return ""

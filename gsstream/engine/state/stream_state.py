@@ -27,7 +27,7 @@ class StreamState:
         player: exactly what every player has after the last packet (decoded from its bytes).
         hierarchy: groups of the layout in ``player``.
         previous: training images of the last frame whose packet changed the scene: what the scene shows.
-            Stored as the recipe says (``data.images``); read them through ``core.storage.unpacked``.
+            Stored as the recipe says (``data.images``).
         decoders: linear decoders to continue from; equal to the player's once they were sent.
         exposure: colour maps of the training cameras, or None.
         key_frame: frame of the last key packet.

@@ -13,7 +13,6 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.log import FrameLog
-from gsstream.core.storage import unpacked
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.engine.fit.photometric import PhotometricLoss, render_exposed
@@ -134,7 +133,7 @@ class EngineContext:
     def noise_sigma(self, view: int) -> float:
         # Where everything moves, the estimate measures the motion instead of the noise, so it is bounded; see
         # MOST_SIGMA.
-        measured = noise_sigma(unpacked(self._previous.images[view]), self._frame.images[view])
+        measured = noise_sigma(self._previous.image(view), self._frame.image(view))
         return min(measured, MAX_PIXEL_SIGMA)
 
     @property

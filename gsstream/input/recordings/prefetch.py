@@ -10,7 +10,7 @@ from types import TracebackType
 
 from gsstream.core.errors import EndOfRecording, GsstreamError, InputError, SourceError
 from gsstream.core.frame import Frame
-from gsstream.core.storage import Storage, packed, unpacked
+from gsstream.core.storage import Storage, packed
 from gsstream.input.recordings.base import FrameSource, LiveSource
 from gsstream.input.recordings.canonical import to_file_coordinates
 
@@ -32,7 +32,7 @@ class Prefetcher:
         indices: which frames, in which order.
         depth: pairs decoded ahead, at least 1; None: 2, and 1 where the images of one take more than ``LARGE_PAIR``.
         workers: decoding threads, at least 1.
-        storage: how training images wait; they are delivered as float32.
+        storage: how training images wait, and are delivered.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Prefetcher:
             self.close()
             raise
         self._submit()
-        return replace(pair[0], images=unpacked(pair[0].images)), pair[1]
+        return pair
 
     def __enter__(self) -> Prefetcher:
         return self

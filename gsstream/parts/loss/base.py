@@ -3,19 +3,38 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 
-from gsstream.core.part import Part
+from gsstream.core.part import Part, Traits
+
+
+@dataclass(frozen=True, slots=True)
+class LossTraits(Traits):
+    """What a loss claims.
+
+    Arguments:
+        takes_bytes: ``prepare`` also takes images of uint8, of which 255 is 1.0, and compares with them as with the
+            same image in float32, bit for bit. For other losses images are made float32 first, in four times the
+            memory.
+    """
+
+    takes_bytes: bool = False
 
 
 class Loss(Part):
     """A per-image loss. ``prepare`` is called once per target and frame, ``evaluate`` once per iteration."""
 
+    traits: ClassVar[LossTraits] = LossTraits()
+
+    def claims(self) -> LossTraits:
+        return self.traits
+
     @abstractmethod
     def prepare(self, target: torch.Tensor) -> Any:
-        """Precompute what depends only on the target [H, W, 3]; opaque to the engine."""
+        """Precompute what depends only on the target [H, W, 3] float32 in [0, 1]; opaque to the engine."""
 
     @abstractmethod
     def evaluate(

@@ -10,7 +10,7 @@ from pydantic import Field
 from gsstream.core.changes import Motion, Scene
 from gsstream.core.changes.motion import GroupTransforms, predict_transforms
 from gsstream.core.part import PartConfig
-from gsstream.core.picture_size import LARGE, enlargement
+from gsstream.core.picture_size import enlargement, is_large
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.parts.motion.base import MotionPart
@@ -97,6 +97,6 @@ class Rigid(MotionPart):
         longest = config.longest * enlargement(work.cameras.width)
         damping = Damping(config.damping, config.hold, longest)
         order = rng.numpy("motion", work.index)
-        small = work.cameras.width < LARGE if config.everywhere == "auto" else config.everywhere
+        small = not is_large(work.cameras.width) if config.everywhere == "auto" else config.everywhere
         tiles: Literal["all", "changed"] = "all" if small else "changed"
         return fit_transforms_newton(work, start, units.row, total, order, damping, tiles)

@@ -203,5 +203,6 @@ def _curvature(
     image = session.render(view, replace(rows, sh0=colour), tile_mask=wanted).image
     recorded = target.exposure.apply(image.detach()) if target.exposure else image.detach()
     # The gradient of a pixel by a colour is the share that its Gaussian has of the pixel's light.
-    backward([image], [weighted_structure_tensor(recorded, target.image)])
+    truth = target.image if target.image.is_floating_point() else target.image.float() / recorded.new_tensor(255)
+    backward([image], [weighted_structure_tensor(recorded, truth)])
     return curvature_of(rows.means, transforms, session.cameras, view, gradient_of(colour)[:, 0] / SH0)

@@ -27,7 +27,8 @@ class ViewTarget:
         loss: the photometric loss.
         prepared: what its ``prepare`` made of ``image``.
         dssim: weight of 1 - SSIM, 0 to 1.
-        image: [H, W, 3] what the camera recorded; only the curvature of transforms reads it.
+        image: [H, W, 3] what the camera recorded, float32 or uint8 of which 255 is 1.0; only the curvature of
+            transforms reads it.
         exposure: colour map of the camera; None: scene colours are what it records.
         tile_weights: [ceil(H / 16), ceil(W / 16)] float32 factors on the gradients of tiles. A tile of 0 is left out,
             and shows the session's scene as it is. None: every tile counts once.

@@ -58,6 +58,18 @@ def check_loss_mask(part: Loss) -> None:
     at_most("gradient with an empty mask", still.abs(), 0.0, 0.0, "no tile is compared")
 
 
+@check("loss", "takes_bytes")
+def check_loss_bytes(part: Loss) -> None:
+    """A target of bytes is the image that it stands for, bit for bit."""
+    image, target = _pair()
+    codes = (target * 255).round().to(torch.uint8)
+    (value, gradient), (want, wanted) = (
+        part.evaluate(image, part.prepare(kind), 0.2) for kind in (codes, codes.float() / codes.new_tensor(255.0))
+    )
+    assert value == want, f"expected the loss of float32, {want!r}, got {value!r} for bytes"
+    equal("gradient", gradient, wanted)
+
+
 @check("loss")
 def check_loss_pure(part: Loss) -> None:
     """Images come out as they went in, a prepared target serves again, and nothing hangs on a graph."""

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from gsstream_cpu_render.adam_part import CpuAdam
+from gsstream_cpu_render.loss import photometric_loss
 from gsstream_cpu_render.loss_part import CpuLoss
 from gsstream_cpu_render.renderer import CpuRenderer
+from numpy.typing import NDArray
 from test_cpu_renderer import rig, scene
 
 from gsstream.api import (
@@ -73,17 +76,27 @@ def test_the_fused_body_takes_colour_maps_into_account() -> None:
     assert_near(fused(*opened(), comparison(coloured=True)), default(*opened(), comparison(coloured=True)), 2e-6)
 
 
+def _of_pixels(statistics: NDArray[np.float32], shape: Sequence[int]) -> NDArray[np.float32]:
+    """[2, H, 3 W] of statistics by tile; what tiles hold beyond the image's border is not written."""
+    rows, columns, maps, side, floats = statistics.shape
+    whole = statistics.transpose(2, 0, 3, 1, 4).reshape(maps, rows * side, columns * floats)
+    return whole[:, : shape[0], : 3 * shape[1]]
+
+
 def test_a_target_knows_its_statistics_where_they_were_needed() -> None:
     """Strip by strip, in any order, they are those that are made in one go."""
     cameras, g = rig(), torch.Generator().manual_seed(4)
     image = torch.rand(cameras.height, cameras.width, 3, generator=g)
     wanted, again = CpuLoss().prepare(image), CpuLoss().prepare(image)
-    assert not wanted.partial[2].any()
+    assert not wanted.statistics[1].any()
     session, rows = opened()
     first = fused(session, rows, ViewTarget(CpuLoss(), wanted, 0.2, image))
-    assert wanted.partial[2].any()
-    for got, expected in zip(wanted.statistics, again.statistics, strict=True):
-        np.testing.assert_array_equal(got, expected)
+    assert wanted.statistics[1].any()
+    for prepared in (wanted, again):
+        photometric_loss(image.numpy(), prepared, gradient=False)
+        assert prepared.statistics[1].all()
+    known = [_of_pixels(prepared.statistics[0], image.shape) for prepared in (wanted, again)]
+    np.testing.assert_array_equal(*known)
     second = fused(opened()[0], rows, ViewTarget(CpuLoss(), again, 0.2, image))
     assert first.loss == second.loss
     for (_, one), (_, other) in zip(first.grad.items(), second.grad.items(), strict=True):

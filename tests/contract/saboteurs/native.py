@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from gsstream.core.joint import JointLayout
+from gsstream.parts.loss.base import LossTraits
 from gsstream.parts.optimiser.adam import ReferenceAdam
 from gsstream.parts.optimiser.joint import JointResidualOptimiser
 from gsstream.parts.optimiser.residual import ResidualEpoch, ResidualOptimiser
@@ -71,6 +72,16 @@ class EmptyIsAll(Loss):
         mask = tile_mask if tile_mask is not None and bool(tile_mask.any()) else None
         evaluated: tuple[torch.Tensor, torch.Tensor] = super().evaluate(image, prepared, dssim, mask)
         return evaluated
+
+
+@spoils("check_loss_bytes")
+class Shifted(Loss):
+    """Takes 256 for the byte that means white."""
+
+    traits = LossTraits(takes_bytes=True)
+
+    def prepare(self, target: torch.Tensor) -> Any:
+        return super().prepare(target if target.is_floating_point() else target.float() / 256)
 
 
 @spoils("check_loss_pure")

@@ -10,7 +10,6 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame
 from gsstream.core.shapes import BoolArray, FloatArray, IntArray
-from gsstream.core.storage import unpacked
 from gsstream.engine.step.active.blocks import BLOCK, changed_blocks
 from gsstream.parts.render.base import TILE
 
@@ -90,7 +89,7 @@ def detect_changed_tiles(previous: Frame, frame: Frame, threshold: float) -> Cha
     """
     if threshold == 0:
         return None
-    tiles = [_changed(unpacked(a), b, threshold) for a, b in zip(previous.images, frame.images, strict=True)]
+    tiles = [_changed(previous.image(view), frame.image(view), threshold) for view in range(len(frame.cameras))]
     return Change(torch.from_numpy(np.stack(tiles)), frame.cameras.height, frame.cameras.width)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsstream_cpu_render import _native
-from gsstream_cpu_render.checks import Float32, first_non_finite, native_array, refuse, refuse_value
+from gsstream_cpu_render.checks import Float32, as_array, first_non_finite, native_array, refuse, refuse_value
 
 TILE = 16
 """Side of a tile, pixels."""
@@ -25,33 +25,44 @@ MOST = 1e15
 class PreparedImage:
     """A target image with its window statistics, computed once and used in every iteration of a frame.
 
-    ``image`` [H, W, 3] float32, which must not change while this is in use. Statistics are made strip by strip where
-    they are first needed, for the rows that change are seen in few tiles. Raises ShapeError for a wrong shape or dtype
-    and for a value that is not finite.
+    Statistics are made strip by strip where they are first needed, for the rows that change are seen in few tiles.
+
+    Arguments:
+        image: [H, W, 3] float32, or uint8 of which 255 is 1.0 (the same bits as its float32); it must not change while
+            this is in use.
+        compact: keep mean and root of the variance of each window as 16-bit codes, in half the memory, where the image
+            lies in [0, 1]. A code is off by at most 1/131,070 of the mean and half of that of the root.
+
+    Raises ShapeError for a wrong shape or dtype and for a value that is not finite.
     """
 
-    image: Float32
-    #: Blurred image and windowed variance [H, W, 3], and in which strips of tiles they are known (1) already.
-    partial: tuple[Float32, Float32, NDArray[np.uint8]] = field(init=False, repr=False)
+    image: Float32 | NDArray[np.uint8]
+    compact: bool = False
+    #: Mean and variance of the windows by tile [rows, columns, 2, 16, 48], as float32 or as codes, and in which strips
+    #: of tiles they are known (1) already.
+    statistics: tuple[NDArray[Any], NDArray[np.uint8]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        image = _image("target", self.image)
-        # NaN is passed on by both; the statistics square what they are given.
-        largest = max(abs(float(image.min())), abs(float(image.max())))
-        if not largest < MOST:
-            refuse(first_non_finite("target", image) or "target: expected values in [0, 1], got some that overflow")
+        image = as_array("target", self.image)
+        in_range = image.dtype == np.uint8
+        image = _image("target", image, np.uint8 if in_range else np.float32)
+        if not in_range:
+            # NaN is passed on by both; the statistics square what they are given.
+            low, high = float(image.min()), float(image.max())
+            if not max(abs(low), abs(high)) < MOST:
+                refuse(first_non_finite("target", image) or "target: expected values in [0, 1], got some that overflow")
+            in_range = low >= 0 and high <= 1
         rows, columns = tile_shape(*image.shape[:2])
         known = np.zeros((rows, -(-columns // _native.STRIP_TILES)), np.uint8)
+        # Not filled: tiles that nothing asks about take no memory.
+        kept = np.empty((rows, columns, 2, TILE, 3 * TILE), np.uint16 if self.compact and in_range else np.float32)
         object.__setattr__(self, "image", image)
-        object.__setattr__(self, "partial", (np.empty_like(image), np.empty_like(image), known))
+        object.__setattr__(self, "statistics", (kept, known))
 
     @property
-    def statistics(self) -> tuple[Float32, Float32]:
-        """Blurred image and windowed variance [H, W, 3], whole."""
-        mean, variance, known = self.partial
-        if not known.all():
-            _native.photometric_target(self.image, mean, variance, known)
-        return mean, variance
+    def handle(self) -> Any:
+        """Image and statistics as the kernels take them."""
+        return _native.Target(self.image, *self.statistics)
 
 
 @dataclass(frozen=True)
@@ -88,7 +99,7 @@ def photometric_loss(
     Args:
         image: [H, W, 3] float32. With a mask, pixels up to 5 beyond active tiles are read too (SSIM windows), so the
             inactive part must hold the rest of the picture, for instance the cached render of the previous frame.
-        target: [H, W, 3] float32, or a PreparedImage, which saves blurring it again.
+        target: [H, W, 3] float32 or uint8, or a PreparedImage, which saves blurring it again.
         dssim_weight: w in [0, 1].
         tile_mask: [ceil(H/16), ceil(W/16)] bool or uint8; None means all tiles. The sums are divided by 3 H W as in
             the dense loss, so that losses of disjoint masks add up to it.
@@ -105,7 +116,8 @@ def photometric_loss(
         refuse_value(f"dssim_weight: expected a number in [0, 1], got {dssim_weight!r}")
     image = _image("image", image)
     known = target if isinstance(target, PreparedImage) else None
-    goal = native_array("target", target if known is None else known.image, np.float32, image.shape)
+    goal = as_array("target", target if known is None else known.image)
+    goal = native_array("target", goal, np.uint8 if goal.dtype == np.uint8 else np.float32, image.shape)
     height, width, _ = image.shape
     wanted = _mask(tile_mask, height, width)
     # Without a mask there is nothing beside, and the kernel takes the whole image in one go.
@@ -117,9 +129,9 @@ def photometric_loss(
     else:
         result = native_array("out", out, np.float32, image.shape, writable=True)
     scale = 1.0 / image.size
-    statistics = (None, None) if known is None else known.statistics
+    handle = _native.Target(goal) if known is None else known.handle
     l1, dssim = _native.photometric_evaluate(
-        image, goal, *statistics, active, wanted, result, (1.0 - dssim_weight) * scale, -dssim_weight * scale
+        image, handle, active, wanted, result, (1.0 - dssim_weight) * scale, -dssim_weight * scale
     )
     if not np.isfinite(l1 + dssim):
         refuse(first_non_finite("image", image) or first_non_finite("target", goal)
@@ -132,8 +144,8 @@ def weighted(l1: float, dssim: float, dssim_weight: float, scale: float) -> floa
     return float((1.0 - dssim_weight) * (l1 * scale) + dssim_weight * (dssim * scale))
 
 
-def _image(name: str, value: Any) -> Float32:
-    array = native_array(name, value, np.float32, ("H", "W", 3))
+def _image(name: str, value: Any, dtype: type[np.generic] = np.float32) -> NDArray[Any]:
+    array = native_array(name, value, dtype, ("H", "W", 3))
     if array.size == 0:
         refuse(f"{name}: expected at least one pixel, got shape {list(array.shape)}")
     return array

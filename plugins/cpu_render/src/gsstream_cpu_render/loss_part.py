@@ -6,7 +6,7 @@ from typing import Any, final
 
 import torch
 
-from gsstream.api import Loss
+from gsstream.api import Loss, LossTraits, is_large
 from gsstream_cpu_render.loss import PreparedImage, photometric_loss
 
 
@@ -16,8 +16,10 @@ class CpuLoss(Loss):
 
     source = "3DGS (Kerbl et al. 2023)"
 
+    traits = LossTraits(takes_bytes=True)
+
     def prepare(self, target: torch.Tensor) -> Any:
-        return PreparedImage(target.detach().numpy())
+        return PreparedImage(target.detach().numpy(), compact=is_large(target.shape[1]))
 
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None

@@ -110,7 +110,7 @@ class NativeRasterizer:
         scales = (1.0 - dssim_weight) * scale, -dssim_weight * scale
         try:
             return _native.Comparison(
-                self._view.background, cached_image, target.image, *target.partial, *colours, *scales, weights
+                self._view.background, cached_image, target.handle, *colours, *scales, weights
             )
         except ValueError as error:
             refuse_value(str(error))

@@ -3,20 +3,18 @@
 #include <optional>
 
 #include "fit/view_loss_grad.hpp"
+#include "photometric/target_arrays.hpp"
 #include "raster/scene_arrays.hpp"
 
 namespace gsstream_cpu {
 
 class ComparisonArrays {
  public:
-  ComparisonArrays(ConstFloatArray background, std::optional<ConstFloatArray> cached_image, ConstFloatArray target,
-                   ConstFloatArray mean, ConstFloatArray variance, ByteOutArray known,
-                   std::optional<ConstFloatArray> matrix,
-                   std::optional<ConstFloatArray> offset, double l1_scale, double ssim_scale,
-                   std::optional<ConstFloatArray> weights)
+  ComparisonArrays(ConstFloatArray background, std::optional<ConstFloatArray> cached_image, const TargetArrays& target,
+                   std::optional<ConstFloatArray> matrix, std::optional<ConstFloatArray> offset, double l1_scale,
+                   double ssim_scale, std::optional<ConstFloatArray> weights)
       : cached_(cached_image),
-        images_{target, mean, variance},
-        known_(known),
+        target_(target),
         background_(background),
         matrix_(matrix),
         offset_(offset),
@@ -39,20 +37,18 @@ class ComparisonArrays {
   ViewComparison whole_view(int width, int height) const {
     const std::size_t w = static_cast<std::size_t>(width), h = static_cast<std::size_t>(height);
     const auto cells = [](std::size_t pixels) { return (pixels + MASK_TILE - 1) / MASK_TILE; };
-    for (const ConstFloatArray& image : images_) require_shape(image, {h, w, 3}, "image");
+    target_.require_size(h, w);
     if (cached_) require_shape(*cached_, {h, w, 3}, "image");
-    require_shape(known_, {cells(h), static_cast<std::size_t>(strips_of(static_cast<int>(cells(w))))}, "known");
     if (weights_) require_shape(*weights_, {cells(h), cells(w)}, "tile_weights");
     const float* b = background_.data();
-    return {cached_ ? cached_->data() : nullptr, images_[0].data(), images_[1].data(), images_[2].data(), known_.data(),
+    return {cached_ ? cached_->data() : nullptr, target_.pixels, target_.statistics,
             matrix_ ? matrix_->data() : nullptr, offset_ ? offset_->data() : nullptr, {b[0], b[1], b[2]},
             l1_scale_, ssim_scale_, weights_ ? weights_->data() : nullptr};
   }
 
  private:
   std::optional<ConstFloatArray> cached_;
-  ConstFloatArray images_[3];
-  ByteOutArray known_;
+  TargetArrays target_;
   ConstFloatArray background_;
   std::optional<ConstFloatArray> matrix_, offset_, weights_;
   float l1_scale_, ssim_scale_;

@@ -4,7 +4,7 @@
 
 namespace gsstream_cpu {
 
-void structure_of_line(const float* image, const float* target, int width, int height, std::size_t first,
+void structure_of_line(const float* image, const TargetPixels& target, int width, int height, std::size_t first,
                        std::size_t count, float* out) {
   const std::size_t line = static_cast<std::size_t>(width), y = first / line;
   const std::size_t above = y > 0 ? line : 0, below = y + 1 < static_cast<std::size_t>(height) ? line : 0;

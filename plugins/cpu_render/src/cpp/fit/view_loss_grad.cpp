@@ -134,9 +134,7 @@ PhotometricJob photometric_job(int width, int height, const ViewComparison& view
   job.tile_columns = (width + kTile - 1) / kTile;
   job.image = recorded;
   job.target = view.target;
-  job.target_mean = view.mean;
-  job.target_variance = view.variance;
-  job.known = view.known;
+  job.statistics = view.statistics;
   job.l1_scale = view.l1_scale;
   job.ssim_scale = view.ssim_scale;
   return job;

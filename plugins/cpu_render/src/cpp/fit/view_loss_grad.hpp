@@ -12,8 +12,8 @@ namespace gsstream_cpu {
 
 struct ViewComparison {
   const float* cached_image;               // [H, W, 3] render of the cached scene; null where nothing stands still
-  const float *target, *mean, *variance;   // [H, W, 3] each; the last two as photometric_target makes them,
-  uint8_t* known;                          // in these strips of tiles; the others are filled in on the way
+  TargetPixels target;                     // [H, W, 3]
+  TargetStatistics statistics;             // filled in on the way
   const float *matrix, *offset;            // colour map [3, 3], [3] of the camera; or both null
   float background[3];
   float l1_scale, ssim_scale;

@@ -156,21 +156,4 @@ PhotometricSums photometric_run(PhotometricJob job) {
   return sums;
 }
 
-void photometric_target(const float* target, int height, int width, float* mean, float* variance, uint8_t* known) {
-  PhotometricJob job{};
-  job.height = height;
-  job.width = width;
-  job.tile_rows = (height + kTile - 1) / kTile;
-  job.tile_columns = (width + kTile - 1) / kTile;
-  job.target = target;
-  job.target_mean = mean;
-  job.target_variance = variance;
-  job.known = known;
-  workspace().fit(job, false);
-  const PhotometricKernels& kernels = photometric_kernels();
-  parallel_for(static_cast<std::size_t>(job.tile_rows), 1, [&](std::size_t begin, std::size_t end) {
-    for (std::size_t row = begin; row < end; ++row) kernels.target_row(job, static_cast<int>(row), strip_scratch());
-  });
-}
-
 }  // namespace gsstream_cpu

@@ -23,19 +23,33 @@ constexpr int kStripStride = odd_lines(3 * kTile * kStripTiles + 2 * kPad);
 // raw image, raw target, its centre, five vertically blurred maps, two maps of target statistics
 constexpr std::size_t kScratchFloats = static_cast<std::size_t>(kStripStride) * (2 * kRows + 1 + 7 * kTile);
 
+// A target [H, W, 3]: floats, or bytes of which 255 is 1.0. The other one is null.
+struct TargetPixels {
+  const float* floats;
+  const uint8_t* bytes;
+  float operator[](std::size_t i) const { return bytes ? static_cast<float>(bytes[i]) / 255.0f : floats[i]; }
+};
+
+// Blurred target and its windowed variance, tile by tile [tile_rows, tile_columns, 2, kTile, kTileFloats], so that only
+// the memory of tiles that were needed is ever touched. Where `codes` is given, 16-bit codes of the mean and of the root
+// of the variance, for targets in [0, 1]. All null: computed on the way.
+constexpr int kTileFloats = 3 * kTile;
+struct TargetStatistics {
+  float* floats;
+  uint16_t* codes;
+  uint8_t* known;  // [tile_rows, strips of kStripTiles] where they are known; the others are made where they are needed
+};
+
 struct PhotometricJob {
   int height, width, tile_rows, tile_columns;
   const float* image;
-  const float* target;
-  const float* target_mean;      // [H, W, 3] blurred target, or null: computed on the way
-  const float* target_variance;  // [H, W, 3] blurred target^2 - mean^2, or null like target_mean
-  uint8_t* known;                // [tile_rows, strips of kStripTiles] where mean and variance are known; the others are
-                                 // filled in where they are needed (const is cast away). Null: everywhere
-  const uint8_t* active;         // [tile_rows, tile_columns] tiles in the sum
-  const uint8_t* wanted;         // tiles whose gradient is written; contains active
-  const float* window;           // 6 weights, from the rim to the centre
-  const float* column_weight;    // [3 * 16 * tile_columns] sum of the window's weights inside the image, per float column
-  const float* row_weight;       // [16 * tile_rows]
+  TargetPixels target;
+  TargetStatistics statistics;
+  const uint8_t* active;       // [tile_rows, tile_columns] tiles in the sum
+  const uint8_t* wanted;       // tiles whose gradient is written; contains active
+  const float* window;         // 6 weights, from the rim to the centre
+  const float* column_weight;  // [3 * 16 * tile_columns] sum of the window's weights inside the image, per float column
+  const float* row_weight;     // [16 * tile_rows]
   float* maps[3];                // derivatives of SSIM at pixel (0, 0), padded with zeros; or null
   std::ptrdiff_t map_stride;
   float* gradient;               // [H, W, 3]
@@ -44,9 +58,6 @@ struct PhotometricJob {
 };
 
 struct PhotometricKernels {
-  // Blurred target and its variance into job.target_mean / target_variance (const is cast away), where they are not
-  // known yet, of all tiles of a row.
-  void (*target_row)(const PhotometricJob&, int tile_row, float* scratch);
   // Sums and derivative maps of the active tiles of a row; zeroes the maps of inactive neighbours of wanted tiles.
   void (*forward_row)(const PhotometricJob&, int tile_row, float* scratch);
   // Gradient of the wanted tiles of a row. Needs the maps of the rows above and below.
@@ -62,7 +73,5 @@ struct PhotometricSums {
 PhotometricSums photometric_run(PhotometricJob job);
 // Strips of tiles whose statistics are made together, in a row of tiles.
 constexpr int strips_of(int tile_columns) { return (tile_columns + kStripTiles - 1) / kStripTiles; }
-// Writes mean and variance [H, W, 3] of the target, but where they are `known` already; null: everywhere.
-void photometric_target(const float* target, int height, int width, float* mean, float* variance, uint8_t* known);
 
 }  // namespace gsstream_cpu

@@ -15,7 +15,10 @@ constexpr float kC1 = 0.01f * 0.01f;
 constexpr float kC2 = 0.03f * 0.03f;
 
 void load_target(const PhotometricJob& job, const Strip& s, Scratch& t) {
-  load_strip(job, s, job.target, t.target);
+  if (job.target.bytes)
+    load_strip(job, s, job.target.bytes, t.target);
+  else
+    load_strip(job, s, job.target.floats, t.target);
   find_centre(job, s, t.target, t.centre);
   fill_outside(job, s, t.centre, t.target);
 }
@@ -69,13 +72,12 @@ struct Similarity {
   Floats loss, plain, by_image, by_difference;
 };
 
-GSS_INLINE Similarity similarity(const Strip& s, const Window& window, const Scratch& t, const float* target_mean,
-                                 const float* target_variance, int r, int j) {
-  const int at = r * kStripStride + kPad + j, left = s.floats - j;
+GSS_INLINE Similarity similarity(const Window& window, const Scratch& t, int r, int j) {
+  const int at = r * kStripStride + kPad + j;
   const Floats dm = horizontal(t.blurred[0] + at, window), p = dm * dm;
   const Floats q = horizontal(t.blurred[1] + at, window) - p;
   const Floats centre = load(t.centre + kPad + j);
-  const Floats mean2 = load_first(target_mean, left), variance2 = load_first(target_variance, left);
+  const Floats mean2 = load(t.mean + at), variance2 = load(t.variance + at);
   // Of d and the target. d is 0 outside the image, so the zero padding needs no correction for the centre here.
   const Floats covariance = horizontal(t.blurred[2] + at, window) - (mean2 - centre) * dm;
   const Floats mean1 = mean2 + dm;
@@ -93,13 +95,10 @@ GSS_INLINE Similarity similarity(const Strip& s, const Window& window, const Scr
 
 void forward_pointwise(const PhotometricJob& job, const Strip& s, const Window& window, const Scratch& t, double* sums) {
   for (int r = 0; r < s.rows; ++r) {
-    const std::ptrdiff_t pixel = (static_cast<std::ptrdiff_t>(s.y0 + r) * job.width + s.x0) * 3;
-    const float* mean = job.target_mean ? job.target_mean + pixel : t.mean + r * kStripStride + kPad;
-    const float* variance = job.target_mean ? job.target_variance + pixel : t.variance + r * kStripStride + kPad;
     const std::ptrdiff_t map = static_cast<std::ptrdiff_t>(s.y0 + r) * job.map_stride + 3 * s.x0;
     Floats l1 = {}, dssim = {};
     for (int j = 0; j < s.floats; j += LANES) {
-      Similarity f = similarity(s, window, t, mean + j, variance + j, r, j);
+      Similarity f = similarity(window, t, r, j);
       const int at = (r + kReach) * kStripStride + kPad + j;
       const Floats difference = load(t.image + at) - load(t.target + at);
       Floats distance = max(difference, -difference);
@@ -138,7 +137,9 @@ void backward_strip(const PhotometricJob& job, const Strip& s, bool active, cons
     const std::ptrdiff_t pixel = (static_cast<std::ptrdiff_t>(s.y0 + r) * job.width + s.x0) * 3;
     for (int j = 0; j < s.floats; j += LANES) {
       const int at = r * kStripStride + kPad + j, left = s.floats - j;
-      const Floats image = load_first(job.image + pixel + j, left), target = load_first(job.target + pixel + j, left);
+      const Floats image = load_first(job.image + pixel + j, left);
+      const Floats target = job.target.bytes ? load_first(job.target.bytes + pixel + j, left)
+                                             : load_first(job.target.floats + pixel + j, left);
       const Floats plain = horizontal(t.blurred[0] + at, window);
       const Floats by_image = horizontal(t.blurred[1] + at, window);
       const Floats by_difference = horizontal(t.blurred[2] + at, window);
@@ -170,30 +171,67 @@ int run_length(const PhotometricJob& job, const uint8_t* mask, int tile_row, int
   return end - first;
 }
 
+// Codes of a mean in [0, 1] and of the root of a variance, which is at most 1 / 4 there. The root, because SSIM compares
+// the variance with C2 = 9e-4: a step of 1 / 131,070 of the root changes their sum by at most 1 part in 5,000.
+constexpr float kMeanCodes = 65535.0f, kRootCodes = 131070.0f;
+
+// Visits the vectors of a tile, which is the i-th of the strip: fn(place in the strip's scratch, place of the mean in
+// the statistics, that of the variance).
+template <class Fn>
+GSS_INLINE void for_tile(const PhotometricJob& job, const Strip& s, int tile, int i, Fn&& fn) {
+  const std::size_t first =
+      (static_cast<std::size_t>(s.y0 / kTile) * job.tile_columns + tile) * 2 * kTile * kTileFloats;
+  const int floats = s.floats - i * kTileFloats < kTileFloats ? s.floats - i * kTileFloats : kTileFloats;
+  for (int r = 0; r < s.rows; ++r)
+    for (int j = 0; j < floats; j += LANES) {
+      const std::size_t mean = first + static_cast<std::size_t>(r * kTileFloats + j);
+      fn(r * kStripStride + kPad + i * kTileFloats + j, mean, mean + kTile * kTileFloats);
+    }
+}
+
+void keep_statistics(const PhotometricJob& job, const Strip& s, int tile, int i, const Scratch& t) {
+  float* floats = job.statistics.floats;
+  uint16_t* codes = job.statistics.codes;
+  for_tile(job, s, tile, i, [&](int at, std::size_t mean, std::size_t variance) {
+    const Floats m = load(t.mean + at), v = load(t.variance + at);
+    if (codes) {
+      store(codes + mean, m * kMeanCodes);
+      store(codes + variance, sqrt(max(v, Floats{})) * kRootCodes);
+    } else {
+      store(floats + mean, m);
+      store(floats + variance, v);
+    }
+  });
+}
+
+void recall_statistics(const PhotometricJob& job, const Strip& s, int tile, int i, const Scratch& t) {
+  const float* floats = job.statistics.floats;
+  const uint16_t* codes = job.statistics.codes;
+  for_tile(job, s, tile, i, [&](int at, std::size_t mean, std::size_t variance) {
+    if (codes) {
+      const Floats root = load(codes + variance) * (1.0f / kRootCodes);
+      store(t.mean + at, load(codes + mean) * (1.0f / kMeanCodes));
+      store(t.variance + at, root * root);
+    } else {
+      store(t.mean + at, load(floats + mean));
+      store(t.variance + at, load(floats + variance));
+    }
+  });
+}
+
 // Makes the statistics of those strips from tile `first` to `end` of a row where they are not known.
 void fill_statistics(const PhotometricJob& job, int tile_row, int first, int end, const Window& window, Scratch& t) {
-  uint8_t* known = job.known ? job.known + tile_row * strips_of(job.tile_columns) : nullptr;
+  uint8_t* known = job.statistics.known + tile_row * strips_of(job.tile_columns);
   for (int strip = first / kStripTiles; strip * kStripTiles < end; ++strip) {
-    if (known && known[strip]) continue;
+    if (known[strip]) continue;
     const int tile = strip * kStripTiles;
     const int tiles = job.tile_columns - tile < kStripTiles ? job.tile_columns - tile : kStripTiles;
     const Strip s = make_strip(job, tile_row, tile, tiles);
     load_target(job, s, t);
     target_statistics(job, s, window, t);
-    for (int r = 0; r < s.rows; ++r) {
-      const std::ptrdiff_t pixel = (static_cast<std::ptrdiff_t>(s.y0 + r) * job.width + s.x0) * 3;
-      const int at = r * kStripStride + kPad;
-      std::memcpy(const_cast<float*>(job.target_mean) + pixel, t.mean + at, sizeof(float) * s.floats);
-      std::memcpy(const_cast<float*>(job.target_variance) + pixel, t.variance + at, sizeof(float) * s.floats);
-    }
-    if (known) known[strip] = 1;
+    for (int i = 0; i < tiles; ++i) keep_statistics(job, s, tile + i, i, t);
+    known[strip] = 1;
   }
-}
-
-void target_row(const PhotometricJob& job, int tile_row, float* scratch) {
-  const Window window = load_window(job.window);
-  Scratch t(scratch);
-  fill_statistics(job, tile_row, 0, job.tile_columns, window, t);
 }
 
 void forward_row(const PhotometricJob& job, int tile_row, float* scratch) {
@@ -206,13 +244,16 @@ void forward_row(const PhotometricJob& job, int tile_row, float* scratch) {
       continue;
     }
     tiles = run_length(job, job.active, tile_row, tile);
-    if (job.known) fill_statistics(job, tile_row, tile, tile + tiles, window, t);
+    if (job.statistics.known) fill_statistics(job, tile_row, tile, tile + tiles, window, t);
     const Strip s = make_strip(job, tile_row, tile, tiles);
     load_target(job, s, t);
     load_strip(job, s, job.image, t.image);
     fill_outside(job, s, t.centre, t.image);
     blur_difference(s, window, t);
-    if (job.target_mean == nullptr) target_statistics(job, s, window, t);
+    if (job.statistics.known)
+      for (int i = 0; i < tiles; ++i) recall_statistics(job, s, tile + i, i, t);
+    else
+      target_statistics(job, s, window, t);
     double* sums = job.partial + 2 * (tile_row * job.tile_columns + tile);
     forward_pointwise(job, s, window, t, sums);
   }
@@ -231,7 +272,7 @@ void backward_row(const PhotometricJob& job, int tile_row, float* scratch) {
 }  // namespace
 
 const PhotometricKernels& photometric_kernels() {
-  static const PhotometricKernels table{target_row, forward_row, backward_row};
+  static const PhotometricKernels table{forward_row, backward_row};
   return table;
 }
 

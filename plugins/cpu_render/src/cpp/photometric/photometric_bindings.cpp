@@ -8,6 +8,7 @@
 
 #include "runtime/bindings.hpp"
 #include "photometric/photometric.hpp"
+#include "photometric/target_arrays.hpp"
 
 namespace nb = nanobind;
 
@@ -24,23 +25,17 @@ void require_image(const Array& array, std::size_t height, std::size_t width, co
   require(array.ndim() == 3 && array.shape(0) == height && array.shape(1) == width && array.shape(2) == 3, what);
 }
 
-void require_size(std::size_t height, std::size_t width) {
+void require_sides(std::size_t height, std::size_t width) {
   require(height >= 1 && width >= 1 && height <= 65536 && width <= 65536, "image sides must be 1 to 65536");
 }
 
-std::pair<double, double> evaluate(ConstFloatArray image, ConstFloatArray target, std::optional<ConstFloatArray> mean,
-                                   std::optional<ConstFloatArray> variance, ByteArray active, ByteArray wanted,
+std::pair<double, double> evaluate(ConstFloatArray image, const TargetArrays& target, ByteArray active, ByteArray wanted,
                                    std::optional<FloatArray> gradient, double l1_scale, double ssim_scale) {
   require(image.ndim() == 3, "image must be [H, W, 3]");
   const std::size_t height = image.shape(0), width = image.shape(1);
-  require_size(height, width);
+  require_sides(height, width);
   require_image(image, height, width, "image must be [H, W, 3]");
-  require_image(target, height, width, "target must have the image's shape");
-  require(mean.has_value() == variance.has_value(), "target statistics come together or not at all");
-  if (mean) {
-    require_image(*mean, height, width, "target mean must have the image's shape");
-    require_image(*variance, height, width, "target variance must have the image's shape");
-  }
+  target.require_size(height, width);
   if (gradient) require_image(*gradient, height, width, "gradient must have the image's shape");
   PhotometricJob job{};
   job.height = static_cast<int>(height);
@@ -53,9 +48,8 @@ std::pair<double, double> evaluate(ConstFloatArray image, ConstFloatArray target
             "tile masks must be [ceil(H / 16), ceil(W / 16)]");
   }
   job.image = image.data();
-  job.target = target.data();
-  job.target_mean = mean ? mean->data() : nullptr;
-  job.target_variance = variance ? variance->data() : nullptr;
+  job.target = target.pixels;
+  job.statistics = target.statistics;
   job.active = active.data();
   job.wanted = wanted.data();
   job.gradient = gradient ? gradient->data() : nullptr;
@@ -66,35 +60,17 @@ std::pair<double, double> evaluate(ConstFloatArray image, ConstFloatArray target
   return {sums.l1, sums.dssim};
 }
 
-void prepare(ConstFloatArray target, FloatArray mean, FloatArray variance, ByteOutArray known) {
-  require(target.ndim() == 3, "target must be [H, W, 3]");
-  const std::size_t height = target.shape(0), width = target.shape(1);
-  require_size(height, width);
-  require_image(target, height, width, "target must be [H, W, 3]");
-  require_image(mean, height, width, "mean must have the target's shape");
-  require_image(variance, height, width, "variance must have the target's shape");
-  const std::size_t rows = (height + kTile - 1) / kTile, columns = (width + kTile - 1) / kTile;
-  require(known.ndim() == 2 && known.shape(0) == rows &&
-              known.shape(1) == static_cast<std::size_t>(strips_of(static_cast<int>(columns))),
-          "known must have a place for every strip of tiles");
-  uint8_t* strips = known.data();
-  const float* in = target.data();
-  float *mean_out = mean.data(), *variance_out = variance.data();
-  const nb::gil_scoped_release released;
-  photometric_target(in, static_cast<int>(height), static_cast<int>(width), mean_out, variance_out, strips);
-}
-
 }  // namespace
 
 void bind_photometric(nb::module_& module) {
-  module.def("photometric_evaluate", &evaluate, nb::arg("image").noconvert(), nb::arg("target").noconvert(),
-             nb::arg("target_mean").noconvert().none(), nb::arg("target_variance").noconvert().none(),
+  nb::class_<TargetArrays>(module, "Target", "A target image and where its statistics are kept; not copied.")
+      .def(nb::init<TargetArrays::Pixels, std::optional<TargetArrays::Array>, std::optional<ByteOutArray>>(),
+           nb::arg("pixels").noconvert(), nb::arg("statistics").noconvert().none() = nb::none(),
+           nb::arg("known").noconvert().none() = nb::none());
+  module.def("photometric_evaluate", &evaluate, nb::arg("image").noconvert(), nb::arg("target"),
              nb::arg("active").noconvert(), nb::arg("wanted").noconvert(), nb::arg("gradient").noconvert().none(),
              nb::arg("l1_scale"), nb::arg("ssim_scale"),
              "Sums over active tiles of |I - G| and of 1 - SSIM; writes the scaled gradient of wanted tiles.");
-  module.def("photometric_target", &prepare, nb::arg("target").noconvert(), nb::arg("mean").noconvert(),
-             nb::arg("variance").noconvert(), nb::arg("known").noconvert(),
-             "Writes the blurred target and its windowed variance, in the strips of tiles where they are not known.");
   module.attr("STRIP_TILES") = kStripTiles;
 }
 

@@ -44,9 +44,17 @@ GSS_INLINE Strip make_strip(const PhotometricJob& job, int tile_row, int first, 
   return s;
 }
 
+GSS_INLINE void copy_values(float* to, const float* from, int count) { std::memcpy(to, from, sizeof(float) * count); }
+GSS_INLINE void copy_values(float* to, const uint8_t* from, int count) {
+  int i = 0;
+  for (; i + LANES <= count; i += LANES) store(to + i, load(from + i));
+  for (; i < count; ++i) to[i] = static_cast<float>(from[i]) / 255.0f;
+}
+
 // Copies rows y0-5 .. y0+20 and floats 3*x0-16 .. of an image; zeros right and left of it. Rows above and below the
 // image are left alone.
-GSS_INLINE void load_strip(const PhotometricJob& job, const Strip& s, const float* image, float* raw) {
+template <class Value>
+GSS_INLINE void load_strip(const PhotometricJob& job, const Strip& s, const Value* image, float* raw) {
   const int width = 3 * job.width, left = 3 * s.x0 - kPad, all = s.vectors * LANES;
   const int low = left < 0 ? -left : 0;
   const int high = width - left < all ? width - left : all;
@@ -55,7 +63,7 @@ GSS_INLINE void load_strip(const PhotometricJob& job, const Strip& s, const floa
     if (y < 0 || y >= job.height) continue;
     float* row = raw + r * kStripStride;
     for (int j = 0; j < low; ++j) row[j] = 0.0f;
-    std::memcpy(row + low, image + static_cast<std::ptrdiff_t>(y) * width + left + low, sizeof(float) * (high - low));
+    copy_values(row + low, image + static_cast<std::ptrdiff_t>(y) * width + left + low, high - low);
     for (int j = high; j < all; ++j) row[j] = 0.0f;
   }
 }
@@ -118,9 +126,10 @@ GSS_INLINE Mask first_lanes(int count) {
   return greater_equal(broadcast(static_cast<int32_t>(count - 1)), load(index));
 }
 
-GSS_INLINE Floats load_first(const float* p, int count) {
+template <class Value>
+GSS_INLINE Floats load_first(const Value* p, int count) {
   if (count >= LANES) return load(p);
-  float part[LANES] = {};
+  Value part[LANES] = {};
   for (int i = 0; i < count; ++i) part[i] = p[i];
   return load(part);
 }

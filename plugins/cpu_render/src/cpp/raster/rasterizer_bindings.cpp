@@ -211,12 +211,10 @@ void bind_rasterizer(nb::module_& module) {
                     ConstFloatArray>(),
            strict("means"), strict("quats"), strict("scales"), strict("opacities"), strict("sh0"), strict("shN"));
   nb::class_<ComparisonArrays>(module, "Comparison", "What a render of one view is compared with; not copied.")
-      .def(nb::init<ConstFloatArray, std::optional<ConstFloatArray>, ConstFloatArray, ConstFloatArray, ConstFloatArray,
-                    ByteOutArray, std::optional<ConstFloatArray>, std::optional<ConstFloatArray>, double, double,
-                    std::optional<ConstFloatArray>>(),
-           strict("background"), strict("cached_image").none(), strict("target"), strict("mean"), strict("variance"),
-           strict("known"), strict("matrix").none(), strict("offset").none(), nb::arg("l1_scale"), nb::arg("ssim_scale"),
-           strict("tile_weights").none());
+      .def(nb::init<ConstFloatArray, std::optional<ConstFloatArray>, const TargetArrays&, std::optional<ConstFloatArray>,
+                    std::optional<ConstFloatArray>, double, double, std::optional<ConstFloatArray>>(),
+           strict("background"), strict("cached_image").none(), nb::arg("target"), strict("matrix").none(),
+           strict("offset").none(), nb::arg("l1_scale"), nb::arg("ssim_scale"), strict("tile_weights").none());
   nb::class_<PyRasterizer>(module, "Rasterizer",
                            "Rasteriser of one camera; see gsstream_cpu_render.rasterizer for the checked interface.")
       .def(nb::init<>())

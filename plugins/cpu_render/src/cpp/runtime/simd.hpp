@@ -40,6 +40,22 @@ GSS_INLINE Ints load(const int32_t* p) {
   std::memcpy(&r, p, sizeof r);
   return r;
 }
+// Bytes of which 255 is 1.0. Divided, because a product with 1 / 255 would be another number.
+GSS_INLINE Floats load(const uint8_t* p) {
+  typedef uint8_t Bytes __attribute__((vector_size(LANES)));
+  Bytes bytes;
+  std::memcpy(&bytes, p, sizeof bytes);
+  return __builtin_convertvector(__builtin_convertvector(bytes, Ints), Floats) / 255.0f;
+}
+// Codes of 16 bits as floats.
+GSS_INLINE Floats load(const uint16_t* p) {
+  typedef uint16_t Shorts __attribute__((vector_size(2 * LANES)));
+  Shorts codes;
+  std::memcpy(&codes, p, sizeof codes);
+  return __builtin_convertvector(__builtin_convertvector(codes, Ints), Floats);
+}
+// Rounded to the nearest code; what no code stands for, NaN included, becomes the nearest that there is, or 0.
+GSS_INLINE void store(uint16_t* p, Floats v);
 GSS_INLINE void store(float* p, Floats v) { std::memcpy(p, &v, sizeof v); }
 GSS_INLINE void store(int32_t* p, Ints v) { std::memcpy(p, &v, sizeof v); }
 
@@ -101,6 +117,13 @@ GSS_INLINE Mask is_finite(Ints magnitude) { return greater_equal(broadcast(0x7f7
 
 // x limited to [low, high]; a NaN becomes `low`.
 GSS_INLINE Floats clamp(Floats x, Floats low, Floats high) { return min(max(x, low), high); }
+
+GSS_INLINE void store(uint16_t* p, Floats v) {
+  typedef uint16_t Shorts __attribute__((vector_size(2 * LANES)));
+  const Ints code = __builtin_convertvector(clamp(v, Floats{}, broadcast(65535.0f)) + 0.5f, Ints);
+  const Shorts codes = __builtin_convertvector(code, Shorts);
+  std::memcpy(p, &codes, sizeof codes);
+}
 
 // 1/x for finite x of ordinary size, to about 2 ulp; exact for x = 1 (AVX-512's guess is exact for powers of two, the
 // older guesses are not, and their divisions are cheaper).

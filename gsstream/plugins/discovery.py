@@ -19,6 +19,7 @@ from types import ModuleType
 from typing import Any
 
 import pluggy
+import pydantic
 
 from gsstream import API_VERSION, __version__
 from gsstream.core.errors import PluginUnavailable, suggest
@@ -65,7 +66,7 @@ class Discovered:
         """The error in one line, with its type where the message alone would not say it."""
         if self.error is None:
             return ""
-        text = textwrap.shorten(_message(self.error) or "no message", 300, placeholder=" ...")
+        text = textwrap.shorten(_message(self.error) or "no message", 400, placeholder=" ...")
         return text if isinstance(self.error, PluginFault) else f"{type(self.error).__name__}: {text}"
 
     def unavailable(self, what: str) -> PluginUnavailable:
@@ -136,6 +137,9 @@ def _warn_slow(name: str, distribution: str) -> None:
 
 def _message(error: BaseException) -> str:
     """What an error says, in characters that can be printed; a plugin's own class may fail even at that."""
+    if isinstance(error, pydantic.ValidationError):
+        wrong = (f"{'.'.join(map(str, w['loc']))}: {w['msg']}, got {w['input']!r}" for w in error.errors())
+        return f"{error.title} of component API {API_VERSION}: {'; '.join(wrong)}"
     try:
         return str(error).encode("utf-8", "backslashreplace").decode()
     except Exception as failure:

@@ -23,7 +23,9 @@ REASONS = {
     "wrong_arguments": "PluginValidationError: Plugin 'gsstream_wrong_arguments_plugin' for hook 'gsstream_components' "
     "hookimpl definition: gsstream_components(registry) Argument(s) {'registry'} are declared in the hookimpl but ",
     "wrong_return": "gsstream_components() returned a str in its list; expected ComponentSpec",
-    "bad_spec": "ValidationError: 1 validation error for ComponentSpec kind Input should be 'structure', 'confidence',",
+    "bad_spec": "ValidationError: ComponentSpec of component API 2.0: kind: Input should be 'structure', 'confidence', "
+    "'propagation', 'gate', 'motion', 'update', 'growth', 'regularizer', 'streaming_method', 'renderer', 'loss', "
+    "'optimiser' or 'source', got 'gatte'",
     "command_clash": "declares the command 'run', which gsstream 0.1.0 already provides; rename it",
     "no_hook": "gsstream_no_hook_plugin implements no hook; expected @hookimpl on one of gsstream_components, ",
 }

@@ -77,14 +77,7 @@ def test_unknown_poses_are_recovered_and_the_test_camera_changes_nothing(tmp_pat
 @needs_pycolmap
 def test_known_poses_are_kept_and_points_triangulated(tmp_path: Path) -> None:
     raw, rig = raw_pictures(tmp_path / "raw"), open_source(WORLD).info
-    cameras = [
-        {"id": name, "split": split, "width": 240, "height": 180, "K": K.tolist(), "w2c": w2c.tolist(),
-         "frames": f"{name}/shot%d.png"}
-        for split, part in (("train", rig.train), ("test", rig.test))
-        for name, K, w2c in zip(part.ids, part.Ks, part.viewmats, strict=True)
-    ]  # fmt: skip
-    data = {"schema": "opencv-multiview-1", "name": "raw", "fps": 25, "frames": 2, "cameras": cameras}
-    (raw / "cameras.json").write_text(json.dumps(data))
+    declared(raw)
     made = prepare(raw, tmp_path / "scene", PrepareOptions(), quiet)
     scene = open_source(str(tmp_path / "scene"))
     assert scene.info.fps == 25
@@ -166,15 +159,39 @@ def test_videos_are_raw_cameras(tmp_path: Path) -> None:
 
 @pytest.mark.sfm
 @needs_pycolmap
-def test_videos_without_poses_become_a_small_scene(tmp_path: Path) -> None:
+def test_videos_without_poses_become_a_small_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One of them goes on for longer than the others, which is said."""
     moving = LARGE.replace("frames=1&static=true", "frames=2&supersample=1")
     shown = raw_videos(tmp_path / "raw", 2, moving)
+    write_video(tmp_path / "raw" / "cam04.mkv", np.stack([*shown["cam04"], shown["cam04"][0]]))
     command = ["scene", "prepare", str(tmp_path / "raw"), "--out", str(tmp_path / "scene"), "--lens", "pinhole"]
-    assert run_command([*command, "--test", "test", "--width", "160", "--quiet"]) == 0
+    assert run_command([*command, "--test", "test", "--width", "160"]) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "cameras differ in their frames" in line]
+    assert "cam03 2, cam04 3, cam05 2" in line
+    assert line.endswith("; the first 2 are used")
     scene = open_source(str(tmp_path / "scene"))
     assert (scene.info.num_frames, scene.info.train.width, scene.info.train.height) == (2, 160, 120)
     blocks = np.stack([shown[name][1] for name in scene.info.train.ids]).reshape(-1, 120, 2, 160, 2, 3).mean((2, 4))
     assert np.abs(scene.frame(1).images * 255 - blocks).max() <= 1
+
+
+@pytest.mark.sfm
+@needs_pycolmap
+def test_known_poses_without_features_become_a_scene_without_points(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Cameras that see nothing of each other, as those far apart; a run searches for points of its own."""
+    raw, rng = raw_pictures(tmp_path / "raw", 1), np.random.default_rng(0)
+    for path in raw.glob("*/*.png"):
+        save(path, rng.random((180, 240, 3)))
+    declared(raw, frames=1)
+    assert run_command(["scene", "prepare", str(raw), "--out", str(tmp_path / "scene"), "--quiet"]) == 0
+    assert "share too few features for points" in capsys.readouterr().err
+    scene = open_source(str(tmp_path / "scene"))
+    assert np.array_equal(scene.info.train.viewmats, open_source(WORLD).info.train.viewmats)
+    assert scene.points() is None
+    assert "bounds" not in (tmp_path / "scene" / "cameras.json").read_text()
+    assert "points: none" in (tmp_path / "scene" / "report.md").read_text()
 
 
 def test_what_cannot_be_prepared_is_said(tmp_path: Path) -> None:
@@ -193,7 +210,7 @@ def test_what_cannot_be_prepared_is_said(tmp_path: Path) -> None:
         prepare(tmp_path / "raw", tmp_path / "raw", PrepareOptions(), quiet)
 
 
-def declared(raw: Path, world: str = WORLD, edit=lambda entry: None) -> None:
+def declared(raw: Path, world: str = WORLD, edit=lambda entry: None, frames: int = 2) -> None:
     """cameras.json of a world beside its raw pictures."""
     rig, cameras = open_source(world).info, []
     for split, part in (("train", rig.train), ("test", rig.test)):
@@ -202,7 +219,7 @@ def declared(raw: Path, world: str = WORLD, edit=lambda entry: None) -> None:
                      "frames": f"{name}/shot%d.png"}  # fmt: skip
             edit(entry)
             cameras.append(entry)
-    data = {"schema": "opencv-multiview-1", "name": "raw", "fps": 25, "frames": 2, "cameras": cameras}
+    data = {"schema": "opencv-multiview-1", "name": "raw", "fps": 25, "frames": frames, "cameras": cameras}
     (raw / "cameras.json").write_text(json.dumps(data))
 
 

@@ -5,11 +5,8 @@ zlib comes before pycolmap here too: ``_pycolmap`` says why.
 
 from __future__ import annotations
 
-import sqlite3
-import threading
 import zlib  # noqa: F401  must precede pycolmap
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -43,33 +40,20 @@ def extract(folder: Path, most: int, mode: str = "PER_IMAGE", model: str = "SIMP
     # Small images hold little contrast per octave; the stock threshold finds too few points below 640 pixels.
     extraction.sift.peak_threshold, extraction.sift.max_num_features = 0.002, most
     reader.camera_model = model
-    with _counted(scratch, len(list((folder / IMAGES).iterdir()))):
+    names = sorted(path.name for path in (folder / IMAGES).iterdir())
+    # Some at a time, to say how many are done. Whoever reads the database meanwhile may lock it, which ends COLMAP.
+    step = 2 * extraction.num_threads
+    for begin in range(0, len(names), step):
+        sign(begin, len(names), "finding features: pictures")
         pycolmap.extract_features(
-            scratch, folder / IMAGES, camera_mode=getattr(pycolmap.CameraMode, mode), reader_options=reader,
-            extraction_options=extraction,
+            scratch, folder / IMAGES, image_names=names[begin : begin + step],
+            camera_mode=getattr(pycolmap.CameraMode, mode), reader_options=reader, extraction_options=extraction,
         )  # fmt: skip
+        if mode == "SINGLE" and begin == 0:
+            with pycolmap.Database.open(scratch) as db:
+                reader.existing_camera_id = db.read_all_images()[0].camera_id
     _in_order(scratch, database)
     return database
-
-
-@contextmanager
-def _counted(database: Path, total: int) -> Iterator[None]:
-    """Give signs of how many images have their features in a database while it is filled."""
-    over = threading.Event()
-
-    def count() -> None:
-        while not over.wait(0.5):
-            with suppress(sqlite3.Error), closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as reader:
-                (done,) = reader.execute("SELECT COUNT(*) FROM keypoints").fetchone()
-                sign(done, total, "finding features: pictures")
-
-    counter = threading.Thread(target=count, daemon=True)
-    counter.start()
-    try:
-        yield
-    finally:
-        over.set()
-        counter.join()
 
 
 def _in_order(source: Path, target: Path) -> None:

@@ -20,3 +20,12 @@ from gsstream.player.paths import camera_path as camera_path
 from gsstream.player.playback import Playback as Playback
 from gsstream.player.render import render as render
 from gsstream.player.render import to_bytes as to_bytes
+
+__all__ = [
+    "Delta", "Playback", "PlayerState", "Scene", "StreamReader", "camera_path", "decode_packet", "export", "render",
+    "to_bytes",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -13,3 +13,12 @@ from gsstream.testing.kit import CheckResult as CheckResult
 from gsstream.testing.kit import parametrize_with_checks as parametrize_with_checks
 from gsstream.testing.kit import run_checks as run_checks
 from gsstream.testing.recording import SourceUnderTest as SourceUnderTest
+
+__all__ = [
+    "CheckResult", "SourceUnderTest", "World", "get_case", "images", "make_case", "parametrize_with_checks", "rig",
+    "run_checks", "scene",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -17,6 +19,7 @@ import torch
 from early_densify import densifying
 from growing_plugin import growth_installed
 
+import gsstream
 from gsstream.api import LossTraits
 from gsstream.cli.main import run_command
 from gsstream.core.errors import ComponentError, InputError, RecipeError, ShapeError
@@ -349,11 +352,22 @@ def test_images_of_a_type_that_says_no_white_are_refused(images: Any, message: s
         encoder().encode(replace(frames()[0], images=images))
 
 
-def test_the_door_shows_what_is_for_its_users() -> None:
-    import gsstream.encode as door
-
+@pytest.mark.parametrize("name", ["encode", "play", "spec", "testing"])
+def test_a_door_shows_what_is_for_its_users(name: str) -> None:
+    door = getattr(gsstream, name)
     assert set(dir(door)) == set(door.__all__)
     assert all(hasattr(door, name) for name in door.__all__)
+
+
+def test_the_package_shows_its_doors_and_opens_them_when_they_are_named() -> None:
+    code = (
+        "import sys, gsstream; before = 'gsstream.play' in sys.modules; gsstream.play.Playback\n"
+        "print(before, 'torch' in sys.modules, 'play' in dir(gsstream), 'importlib' in dir(gsstream))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "False", "True", "False"]
+    with pytest.raises(AttributeError, match="no attribute 'plays'; its front doors are api, blocks, encode"):
+        _ = gsstream.plays
 
 
 def test_what_a_step_says_is_what_a_player_makes_of_its_packet() -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.errors import InputError, OutputError, suggest
+from gsstream.core.errors import InputError, OutputError
 from gsstream.core.frame import PointCloud
 from gsstream.core.names import child
 from gsstream.core.shapes import FloatArray
@@ -96,7 +96,7 @@ def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say, tell:
     test = options.test if options.test is not None else known.test if known else ()
     for name in test:
         if name not in names:
-            raise InputError(f"--test: no camera {name!r}{suggest(name, names)}")
+            raise InputError(f"--test: no camera {name!r}; cameras: {', '.join(names)}")
     say(f"{len(cameras)} cameras, {len(test)} of them for testing only; {'known' if known else 'unknown'} poses")
     say("reading frame 0")
     images = first_frames(cameras)

@@ -13,7 +13,7 @@ from gsstream.core.names import check_camera_ids
 from gsstream.core.needs import install_extra
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.clips import Clip
-from gsstream.input.recordings.images import PICTURE_FORMATS, read_image
+from gsstream.input.recordings.images import PICTURE_FORMATS, read_image, told_apart
 from gsstream.input.recordings.video import upright
 
 PICTURES = (".png", ".jpg", ".jpeg")
@@ -73,6 +73,9 @@ def find_cameras(folder: Path) -> list[RawCamera]:
         videos: dict[str, tuple[Path, ...]] = {p.stem: (p,) for p in inside if p.suffix.lower() in VIDEOS}
         found = videos or {p.stem: (p,) for p in _pictures(folder)}
     if len(found) < 2:
+        photographs = [*folder.glob("*.[hH][eE][iI][cCfF]"), *folder.glob("*/*.[hH][eE][iI][cCfF]")]
+        if photographs:
+            raise SourceError(f"{photographs[0]} and {len(photographs) - 1} more: {told_apart(photographs[0])}")
         raise SourceError(
             f"{folder}: cameras found: {len(found)}; expected at least two: a folder of pictures per camera, "
             f"a video per camera, or a picture per camera ({', '.join(PICTURES + VIDEOS)})"
@@ -103,7 +106,8 @@ def _size(path: Path) -> tuple[int, int]:
         with Image.open(path, formats=PICTURE_FORMATS) as image:
             return image.size
     except (OSError, Image.DecompressionBombError) as error:
-        raise SourceError(f"{path}: cannot be read as a picture ({error}); expected PNG or JPEG") from error
+        cure = told_apart(path)
+        raise SourceError(f"{path}: cannot be read as a picture ({error}); expected PNG or JPEG; {cure}") from error
 
 
 def _video_frames(path: Path, most: int | None) -> Iterator[FloatArray]:

@@ -13,7 +13,7 @@ from PIL import Image, UnidentifiedImageError
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.base import FilesMissing
-from gsstream.input.recordings.images import PICTURE_FORMATS, read_image
+from gsstream.input.recordings.images import PICTURE_FORMATS, read_image, told_apart
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
@@ -96,7 +96,7 @@ def _size_of(path: Path) -> tuple[int, int]:
             return image.size
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         raise SourceError(
-            f"{path}: the image cannot be opened ({error}); expected PNG or JPEG: copy or export it again"
+            f"{path}: the image cannot be opened ({error}); expected PNG or JPEG; {told_apart(path)}"
         ) from error
 
 

@@ -22,6 +22,15 @@ _ORIENTATION, _UPRIGHT = 0x0112, 1
 _READABLE = "8-bit JPEG or PNG, or 16-bit PNG, without transparency"
 
 
+def told_apart(path: Path) -> str:
+    """Return what to do about a file that no decoder takes; what phones write is known by its first bytes."""
+    with path.open("rb") as file:
+        head = file.read(12)
+    if head[4:8] == b"ftyp":
+        return f"it is {head[8:12].decode('ascii', 'replace').upper()}, as phones write it: convert it to JPEG or PNG"
+    return "it is probably truncated or not an image: copy or export it again"
+
+
 def read_image(
     path: Path, size: tuple[int, int], target: tuple[int, int], declared: str = "cameras.json declares"
 ) -> FloatArray:
@@ -86,8 +95,7 @@ def _decode(path: Path) -> tuple[np.ndarray[Any, Any], float]:
     # Pillow raises SyntaxError, struct- and zlib-level errors for damaged PNG chunks besides OSError.
     except (OSError, SyntaxError, EOFError, zlib.error, Image.DecompressionBombError) as error:
         raise SourceError(
-            f"{path}: the image cannot be decoded ({error}); expected {_READABLE}. "
-            "It is probably truncated or not an image: copy or export it again"
+            f"{path}: the image cannot be decoded ({error}); expected {_READABLE}; {told_apart(path)}"
         ) from error
 
 

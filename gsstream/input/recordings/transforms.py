@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.errors import SourceError, suggest
+from gsstream.core.errors import SourceError
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.options import DataOptions, Disturbances
@@ -53,7 +53,7 @@ def parse_losses(entries: Sequence[str], ids: Sequence[str]) -> dict[str, list[r
 
 def _known(key: str, name: str, ids: Sequence[str], taken: Sequence[str] | dict[str, int]) -> str:
     if name not in ids:
-        raise SourceError(f"{key}: no camera {name!r}{suggest(name, ids)}")
+        raise SourceError(f"{key}: no camera {name!r}; cameras: {', '.join(ids)}")
     if name in taken:
         raise SourceError(f"{key}: camera {name!r} is given twice")
     return name

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import stat
 import warnings
 from pathlib import Path
@@ -52,6 +53,21 @@ def test_other_formats_are_refused_everywhere(kind, tmp_path, ghostscript) -> No
         with pytest.raises(SourceError, match="JPEG"):
             read()
     assert not ghostscript.exists()
+
+
+def test_what_phones_write_is_named(tmp_path) -> None:
+    """A stub with the header of a HEIC, under its own name and under that of a JPEG."""
+    for camera in ("a", "b"):
+        (tmp_path / "raw" / camera).mkdir(parents=True)
+        (tmp_path / "raw" / camera / "1.HEIC").write_bytes(b"\0\0\0\x18ftypheic" + bytes(20))
+    shutil.copy(tmp_path / "raw" / "a" / "1.HEIC", tmp_path / "1.jpg")
+    for read in (
+        lambda: read_image(tmp_path / "1.jpg", (8, 6), (8, 6)),
+        lambda: ImageClip([tmp_path / "1.jpg"]),
+        lambda: find_cameras(tmp_path / "raw"),
+    ):
+        with pytest.raises(SourceError, match="it is HEIC, as phones write it: convert it to JPEG or PNG"):
+            read()
 
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG"])

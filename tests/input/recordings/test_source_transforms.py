@@ -216,7 +216,7 @@ def test_random_losses_have_their_share_and_spare_frame_0_and_the_test_camera() 
 
 
 FAULTS: dict[str, tuple[dict[str, Any], str]] = {
-    "ghost test": ({"test_cameras": ("cam9",)}, "data.test_cameras: no camera 'cam9'"),
+    "ghost test": ({"test_cameras": ("cam9",)}, "data.test_cameras: no camera 'cam9'; cameras: cam"),
     "ghost train": ({"train_cameras": ("cam9",)}, "data.train_cameras: no camera 'cam9'"),
     "both sides": ({"train_cameras": ("TEST",)}, "would train and test"),
     "twice": ({"test_cameras": ("TEST", "TEST")}, "given twice"),

@@ -60,17 +60,18 @@ def run(
     catalog = load_catalog()
     resolved = resolve_recipe(recipe.method, catalog.recipe_path, recipe.recipe or (), recipe.overrides())
     server = server_beside(out, serve)
-    # The slow imports come last: a mistake on the command line is answered at once.
-    from gsstream.engine.assembly.assemble import assemble
-    from gsstream.engine.run.recording import open_recording, read_first_frame
-    from gsstream.engine.run.session import run as encode
-
-    assembly = assemble(resolved, catalog)
-    # Read before the folder is touched: --overwrite must not delete a run for the sake of a faulty recording.
-    first = None if first_frame is None else read_first_frame(stream_file(first_frame))
     wanted, quiet = shown.wanted(), shown.quiet
     say, named = _silent if quiet else _note, bool(recipe.method or recipe.recipe)
-    with working("opening the recording", quiet):
+    with working("loading the method", quiet) as signs:
+        # The slow imports come last: a mistake on the command line is answered at once.
+        from gsstream.engine.assembly.assemble import assemble
+        from gsstream.engine.run.recording import open_recording, read_first_frame
+        from gsstream.engine.run.session import run as encode
+
+        assembly = assemble(resolved, catalog)
+        # Read before the folder is touched: --overwrite must not delete a run for the sake of a faulty recording.
+        first = None if first_frame is None else read_first_frame(stream_file(first_frame))
+        signs.tell("opening the recording")
         recording = open_recording(source, assembly.recipe, catalog)
     try:
         say(assembly.note)

@@ -13,7 +13,7 @@ from gsstream.api import Gaussians, LossAndGrad, ViewTarget
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays, raise_on_faults, require_splats
 from gsstream_cpu_render.autograd import splats_of
-from gsstream_cpu_render.checks import Float32, as_array, refuse_value
+from gsstream_cpu_render.checks import Float32, as_array, lasting_array, refuse_value
 from gsstream_cpu_render.loss import PreparedImage
 from gsstream_cpu_render.native import native_scene
 from gsstream_cpu_render.pool import PooledRasterizer
@@ -26,11 +26,20 @@ class CachedView:
 
     def __init__(self, held: PooledRasterizer, splats: SplatArrays) -> None:
         self.held, self.rasterizer = held, held.rasterizer
-        self.image, self.transmittance = self.rasterizer.forward(splats)
+        shape = self.rasterizer.height, self.rasterizer.width, 3
+        self.image, _ = self.rasterizer.forward(splats, image=lasting_array(shape, np.float32))
+        self._transmittance: Float32 | None = None
         self.rasterizer.forget()
         self.rasterizer.free_scratch()
         self._frozen: tuple[Ids, Any] | None = None
         self.scenes = 0  # how many changes of the scene it has seen
+
+    @property
+    def transmittance(self) -> Float32:
+        """What is left of the light behind everything [H, W]. Native fits never ask; for others it is kept."""
+        if self._transmittance is None:
+            self._transmittance = self.rasterizer.forward_cached()[1]
+        return self._transmittance
 
     def thaw(self) -> None:
         """Other rows may change from now on."""
@@ -50,11 +59,6 @@ class CachedView:
         """Remember what the rasteriser was frozen to."""
         self._frozen = ids, None if mask is None else mask.copy()
 
-    def update(self, ids: Ids, rows: SplatArrays) -> None:
-        """Bring cache and render to the scene in which these rows have these values."""
-        self.scenes += 1
-        self.rasterizer.update(ids, rows, self.image, self.transmittance)
-
     def loss_and_grad(self, rows: Gaussians[torch.Tensor], target: ViewTarget) -> LossAndGrad[Gaussians[torch.Tensor]]:
         """Render the active rows, compare, differentiate."""
         grad = rows.map(lambda value: torch.empty(value.shape))
@@ -71,7 +75,8 @@ class CachedView:
         return self.image, prepared, target.dssim, exposure_arrays(target), weights
 
     def bytes(self) -> int:
-        return self.rasterizer.memory_bytes() + self.image.nbytes + self.transmittance.nbytes
+        kept = 0 if self._transmittance is None else self._transmittance.nbytes
+        return self.rasterizer.memory_bytes() + self.image.nbytes + kept
 
 
 def exposure_arrays(target: ViewTarget) -> list[Any]:
@@ -102,7 +107,7 @@ def update_views(views: Sequence[CachedView], ids: Ids, rows: SplatArrays, backg
     for view in views:
         view.scenes += 1
         view.rasterizer.forget()  # what it kept for a backward pass is not there any more afterwards
-    targets = [(view.rasterizer.handle, view.image, view.transmittance) for view in views]
+    targets = [(view.rasterizer.handle, view.image, view._transmittance) for view in views]
     raise_on_faults(_native.update_views(targets, ids, native_scene(rows), background), rows)
 
 

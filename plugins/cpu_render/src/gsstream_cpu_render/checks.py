@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import mmap
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
@@ -61,6 +63,17 @@ def native_array(
     if writable and not array.flags.writeable:
         refuse(f"{name}: expected a writable array (it is changed in place), got a read-only one; give a copy")
     return array
+
+
+def lasting_array(shape: tuple[int, ...], dtype: type[np.generic]) -> NDArray[Any]:
+    """Return a writable array of zeros in pages of its own, for what outlives the temporary arrays around it.
+
+    Pages take memory when they are first written, and go back to the system with the array; on the heap, such arrays
+    among those that come and go with every picture keep it from being used again.
+    """
+    count = math.prod(shape)
+    pages = mmap.mmap(-1, max(1, count * np.dtype(dtype).itemsize))
+    return np.frombuffer(pages, dtype, count).reshape(shape)
 
 
 def first_non_finite(name: str, array: NDArray[Any]) -> str | None:

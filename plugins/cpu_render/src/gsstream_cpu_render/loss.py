@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsstream_cpu_render import _native
-from gsstream_cpu_render.checks import Float32, as_array, first_non_finite, native_array, refuse, refuse_value
+from gsstream_cpu_render.checks import (
+    Float32,
+    as_array,
+    first_non_finite,
+    lasting_array,
+    native_array,
+    refuse,
+    refuse_value,
+)
 
 TILE = 16
 """Side of a tile, pixels."""
@@ -54,8 +62,8 @@ class PreparedImage:
             in_range = low >= 0 and high <= 1
         rows, columns = tile_shape(*image.shape[:2])
         known = np.zeros((rows, -(-columns // _native.STRIP_TILES)), np.uint8)
-        # Not filled: tiles that nothing asks about take no memory.
-        kept = np.empty((rows, columns, 2, TILE, 3 * TILE), np.uint16 if self.compact and in_range else np.float32)
+        dtype = np.uint16 if self.compact and in_range else np.float32
+        kept = lasting_array((rows, columns, 2, TILE, 3 * TILE), dtype)
         object.__setattr__(self, "image", image)
         object.__setattr__(self, "statistics", (kept, known))
 

@@ -6,6 +6,7 @@
 
 #include "fit/colour_map.hpp"
 #include "fit/structure.hpp"
+#include "raster/claim.hpp"
 #include "runtime/buffer.hpp"
 #include "runtime/parallel.hpp"
 
@@ -18,6 +19,7 @@ constexpr float SH0 = 0.28209479177387814f;  // colour per unit of sh0
 // Memory of one calling thread, kept between calls.
 struct Workspace {
   Buffer<float> image, recorded, gradient, structure;
+  PassMemory pass;
   std::vector<uint8_t> touched, around, read, counted;  // by tiles of 16 x 16 pixels
 };
 
@@ -143,6 +145,7 @@ PhotometricJob photometric_job(int width, int height, const ViewComparison& view
 ViewLossGrad view_loss_and_grad(Rasterizer& rasterizer, const Scene& rows, const ViewComparison& view, const GradientArrays& out,
                    float* structure) {
   Workspace& work = workspace();
+  const Rasterizer::Loan loan(rasterizer, work.pass);
   const Grid grid{rasterizer.width(), rasterizer.height(), (rasterizer.width() + kTile - 1) / kTile,
                   (rasterizer.height() + kTile - 1) / kTile};
   const std::size_t pixels = static_cast<std::size_t>(grid.width) * grid.height;

@@ -14,9 +14,61 @@ namespace {
 
 constexpr std::size_t CLEAR_GRAIN = 16384;  // rows
 
+// Memory of one call, kept by the thread that calls: what a view needs here, the next one needs, too.
+struct Workspace {
+  std::unique_ptr<ProjectChunk[]> chunks;
+  std::size_t chunk_capacity = 0;
+  Buffer<DepthItem> sort;
+};
+
+Workspace& workspace() {
+  thread_local Workspace own;
+  return own;
+}
+
 std::size_t chunk_count(std::size_t rows) { return (rows + PROJECT_CHUNK - 1) / PROJECT_CHUNK; }
 
+// The results of chunks, one after the other.
+void join_chunks(const ProjectChunk* chunk, std::size_t chunks, VisibleSet& visible) {
+  std::vector<std::size_t> first_visible(chunks + 1, 0), first_pair(chunks + 1, 0);
+  for (std::size_t c = 0; c < chunks; c++) {
+    first_visible[c + 1] = first_visible[c] + chunk[c].visible;
+    first_pair[c + 1] = first_pair[c] + chunk[c].pairs.size;
+  }
+  visible.count = first_visible[chunks];
+  visible.pair_count = first_pair[chunks];
+  if (visible.pair_count >= FROZEN)
+    throw std::length_error("expected fewer than 2^32-1 (Gaussian, tile) pairs, got " +
+                            std::to_string(visible.pair_count) +
+                            ". Are the scales in log units of the scene? Render fewer or smaller Gaussians.");
+  visible.rows.require(visible.count);
+  visible.pair_offset.require(visible.count + 1);
+  visible.by_depth.require(visible.count);
+  visible.pairs.require(visible.pair_count);
+  visible.pair_offset[visible.count] = static_cast<uint32_t>(visible.pair_count);
+  parallel_for(chunks, 4, [&](std::size_t begin, std::size_t end) {
+    for (std::size_t c = begin; c < end; c++) {
+      const ProjectChunk& one = chunk[c];
+      if (one.pairs.size)
+        std::memcpy(&visible.pairs[first_pair[c]], one.pairs.data, one.pairs.size * sizeof(Pair));
+      uint32_t pair = static_cast<uint32_t>(first_pair[c]);
+      for (uint32_t i = 0; i < one.visible; i++) {
+        const uint32_t slot = static_cast<uint32_t>(first_visible[c]) + i;
+        visible.rows[slot] = one.row[i];
+        visible.by_depth[slot] = {one.depth_bits[i], slot};
+        visible.pair_offset[slot] = pair;
+        pair += one.pair_count[i];
+      }
+    }
+  });
+}
+
 }  // namespace
+
+Buffer<float>& moment_workspace() {
+  thread_local Buffer<float> own;
+  return own;
+}
 
 Rasterizer::Rasterizer()
     : isa_(active_isa()),
@@ -60,56 +112,23 @@ TileSelection Rasterizer::cached_tiles(const uint8_t* mask, const char* operatio
   return wanted;
 }
 
-// Stage 1. Results are in visible_ (memory order) and records.
+// Stage 1. Results are in pass_->visible (memory order) and records.
 uint32_t Rasterizer::project(const Scene& scene, const TileSelection& selection, Record* records) {
   const std::size_t chunks = chunk_count(scene.count);
-  if (chunks > chunk_capacity_) {
-    chunks_ = std::make_unique<ProjectChunk[]>(chunks);
-    chunk_capacity_ = chunks;
+  Workspace& work = workspace();
+  if (chunks > work.chunk_capacity) {
+    work.chunks = std::make_unique<ProjectChunk[]>(chunks);
+    work.chunk_capacity = chunks;
   }
   ProjectJob job{scene.arrays,         scene.count,       camera_,
                  selection.tiles_x,    selection.tiles_y, selection.blocks.data(),
-                 selection.sum.data(), records,           chunks_.get()};
+                 selection.sum.data(), records,           work.chunks.get()};
   parallel_for(chunks, 1,
                [&](std::size_t begin, std::size_t end) { project_kernels_.forward[scene.sh_degree](job, begin, end); });
   uint32_t faults = 0;
-  for (std::size_t c = 0; c < chunks; c++) faults |= chunks_[c].faults;
-  if (!faults) join_chunks(chunks);
+  for (std::size_t c = 0; c < chunks; c++) faults |= work.chunks[c].faults;
+  if (!faults) join_chunks(work.chunks.get(), chunks, pass_->visible);
   return faults;
-}
-
-void Rasterizer::join_chunks(std::size_t chunks) {
-  std::vector<std::size_t> first_visible(chunks + 1, 0), first_pair(chunks + 1, 0);
-  for (std::size_t c = 0; c < chunks; c++) {
-    first_visible[c + 1] = first_visible[c] + chunks_[c].visible;
-    first_pair[c + 1] = first_pair[c] + chunks_[c].pairs.size;
-  }
-  visible_.count = first_visible[chunks];
-  visible_.pair_count = first_pair[chunks];
-  if (visible_.pair_count >= FROZEN)
-    throw std::length_error("expected fewer than 2^32-1 (Gaussian, tile) pairs, got " +
-                            std::to_string(visible_.pair_count) +
-                            ". Are the scales in log units of the scene? Render fewer or smaller Gaussians.");
-  visible_.rows.require(visible_.count);
-  visible_.pair_offset.require(visible_.count + 1);
-  visible_.by_depth.require(visible_.count);
-  visible_.pairs.require(visible_.pair_count);
-  visible_.pair_offset[visible_.count] = static_cast<uint32_t>(visible_.pair_count);
-  parallel_for(chunks, 4, [&](std::size_t begin, std::size_t end) {
-    for (std::size_t c = begin; c < end; c++) {
-      const ProjectChunk& chunk = chunks_[c];
-      if (chunk.pairs.size)
-        std::memcpy(&visible_.pairs[first_pair[c]], chunk.pairs.data, chunk.pairs.size * sizeof(Pair));
-      uint32_t pair = static_cast<uint32_t>(first_pair[c]);
-      for (uint32_t i = 0; i < chunk.visible; i++) {
-        const uint32_t slot = static_cast<uint32_t>(first_visible[c]) + i;
-        visible_.rows[slot] = chunk.row[i];
-        visible_.by_depth[slot] = {chunk.depth_bits[i], slot};
-        visible_.pair_offset[slot] = pair;
-        pair += chunk.pair_count[i];
-      }
-    }
-  });
 }
 
 // Stage 3.
@@ -142,23 +161,23 @@ CompositeJob Rasterizer::composite(const TileListsView& lists, const TileSelecti
 }
 
 uint32_t Rasterizer::forward(const Scene& scene, const Camera& camera, const uint8_t* mask, const Target& target) {
-  const Claim claim(busy_);
+  const Claim claim(owner_);
   state_ = State::empty;
   passes_++;
   camera_ = camera;
   selection_.build(camera.width, camera.height, mask);
   const uint32_t faults = project(scene, selection_, records_.require(scene.count));
   if (faults) return faults;
-  sort_by_depth(visible_.by_depth, sort_scratch_, visible_.count);
-  build_tile_lists(visible_, selection_.blocks.size(), 0, merged_lists_);
-  entry_count_ = merged_lists_.size;
+  sort_by_depth(pass_->visible.by_depth, workspace().sort, pass_->visible.count);
+  build_tile_lists(pass_->visible, selection_.blocks.size(), 0, pass_->merged);
+  entry_count_ = pass_->merged.size;
   drop_layers();
   layers_.release();
-  cached_lists_.adopt(merged_lists_);
+  cached_lists_.adopt(pass_->merged);
   job_ = composite(cached_lists_.view(), selection_, target, cached_lists_.contributed.data(), cached_trace_);
   job_tiles_ = selection_.active.size();
   cached_visible_.clear(scene.count);
-  for (std::size_t i = 0; i < visible_.count; i++) cached_visible_.insert(visible_.rows[i]);
+  for (std::size_t i = 0; i < pass_->visible.count; i++) cached_visible_.insert(pass_->visible.rows[i]);
   scene_ = scene;
   scene_count_ = scene.count;
   cached_selection_ = selection_;
@@ -168,7 +187,7 @@ uint32_t Rasterizer::forward(const Scene& scene, const Camera& camera, const uin
 }
 
 void Rasterizer::freeze(const uint8_t* mask, const uint32_t* active, std::size_t count) {
-  const Claim claim(busy_);
+  const Claim claim(owner_);
   TileSelection wanted = cached_tiles(mask, "freeze");
   if (set_active(active, count, "freeze: active_ids") && active_in_cache_.any()) {
     active_in_cache_.keep(cached_lists_.view(), is_active_);
@@ -213,13 +232,13 @@ std::vector<uint8_t> Rasterizer::tiles_of_active() const {
   return marked;
 }
 
-// Projects the active rows and leaves their lists over `selection` in active_lists_.
+// Projects the active rows and leaves their lists over `selection` in pass_->active.
 uint32_t Rasterizer::list_active(const Scene& rows, const TileSelection& selection) {
   const uint32_t base = static_cast<uint32_t>(scene_count_);
   const uint32_t faults = project(rows, selection, records_.data() + base);
   if (faults) return faults;
-  sort_by_depth(visible_.by_depth, sort_scratch_, visible_.count);
-  build_tile_lists(visible_, selection.blocks.size(), base, active_lists_);
+  sort_by_depth(pass_->visible.by_depth, workspace().sort, pass_->visible.count);
+  build_tile_lists(pass_->visible, selection.blocks.size(), base, pass_->active);
   return 0;
 }
 
@@ -234,7 +253,7 @@ uint32_t Rasterizer::begin_active(const Scene& rows, bool touched_only, const ui
   if (faults) return faults;
   if (touched_only) {
     std::vector<uint32_t> touched = dropped_blocks_;
-    add_touched_blocks(active_lists_, touched);
+    add_touched_blocks(pass_->active, touched);
     touched_.restrict(within, touched);
   } else {
     touched_ = within;
@@ -245,26 +264,26 @@ uint32_t Rasterizer::begin_active(const Scene& rows, bool touched_only, const ui
 }
 
 uint32_t Rasterizer::forward_active(const Scene& rows, const Target& target, bool touched_only) {
-  const Claim claim(busy_);
+  const Claim claim(owner_);
   expect("forward_active");
   const uint32_t faults = begin_active(rows, touched_only, nullptr);
   if (faults) return faults;
   if (!frozen_listed_) filter_tile_lists(cached_lists_.view(), selection_.blocks, is_active_, frozen_lists_);
   frozen_listed_ = true;
-  merge_tile_lists(frozen_lists_, active_lists_, touched_.blocks,
-                   {records_.data(), static_cast<uint32_t>(scene_count_), active_rows_.data()}, merged_lists_);
-  entry_count_ = merged_lists_.size;
-  job_ = composite(merged_lists_.view(), touched_, target, contributed_.require(entry_count_), trace_);
+  merge_tile_lists(frozen_lists_, pass_->active, touched_.blocks,
+                   {records_.data(), static_cast<uint32_t>(scene_count_), active_rows_.data()}, pass_->merged);
+  entry_count_ = pass_->merged.size;
+  job_ = composite(pass_->merged.view(), touched_, target, pass_->contributed.require(entry_count_), pass_->trace);
   state_ = State::active_passed;
   return 0;
 }
 
 void Rasterizer::forward_cached(const uint8_t* mask, const Target& target) {
-  const Claim claim(busy_);
+  const Claim claim(owner_);
   const TileSelection wanted = cached_tiles(mask, "forward_cached");
   drop_pass();
   passes_++;
-  composite(cached_lists_.view(), wanted, target, contributed_.require(cached_lists_.used), trace_);
+  composite(cached_lists_.view(), wanted, target, pass_->contributed.require(cached_lists_.used), pass_->trace);
 }
 
 void Rasterizer::clear_gradients(const GradientArrays& out) const {
@@ -281,34 +300,35 @@ void Rasterizer::clear_gradients(const GradientArrays& out) const {
 // Stages 4 and 5.
 void Rasterizer::differentiate(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out,
                                bool compact) {
+  Buffer<float>& moments = moment_workspace();
   const CompositeBackwardJob raster{job_, image_gradient, alpha_gradient,
-                                    moments_.require(visible_.pair_count * MOMENT_STRIDE)};
+                                    moments.require(pass_->visible.pair_count * MOMENT_STRIDE)};
   parallel_for(job_tiles_, TILE_GRAIN,
                [&](std::size_t begin, std::size_t end) { composite_kernels_.backward(raster, begin, end); });
   if (!compact) clear_gradients(out);
   const ProjectBackwardJob job{
-      scene_.arrays,   camera_, visible_.count, visible_.rows.data(), visible_.pair_offset.data(),
-      moments_.data(), out,     compact};
-  parallel_for(visible_.count, BACKWARD_GRAIN, [&](std::size_t begin, std::size_t end) {
+      scene_.arrays,   camera_, pass_->visible.count, pass_->visible.rows.data(), pass_->visible.pair_offset.data(),
+      moments.data(), out,     compact};
+  parallel_for(pass_->visible.count, BACKWARD_GRAIN, [&](std::size_t begin, std::size_t end) {
     project_backward_kernels_.backward[scene_.sh_degree](job, begin, end);
   });
 }
 
 void Rasterizer::backward(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out,
                           bool compact) {
-  const Claim claim(busy_);
+  const Claim claim(owner_);
   expect("backward");
   differentiate(image_gradient, alpha_gradient, out, compact);
 }
 
 void Rasterizer::backward_active(const float* image_gradient, const float* alpha_gradient, const GradientArrays& out) {
-  const Claim claim(busy_);
+  const Claim claim(owner_);
   expect("backward_active");
   differentiate(image_gradient, alpha_gradient, out, false);
 }
 
 void Rasterizer::backward_layered(const float* image_gradient, const GradientArrays& out) {
-  const Claim claim(busy_);
+  const Claim claim(owner_);
   expect("backward_layered");
   differentiate(image_gradient, nullptr, out, false);
 }

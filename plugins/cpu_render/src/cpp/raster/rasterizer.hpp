@@ -15,6 +15,7 @@
 #include <cstdint>
 #include <memory>
 #include <string>
+#include <thread>
 #include <vector>
 
 #include "runtime/buffer.hpp"
@@ -59,6 +60,21 @@ struct PixelTrace {
   std::size_t bytes() const { return transmittance.bytes() + last.bytes(); }
 };
 
+// The moments of a backward, in memory of the calling thread: they are summed up before it returns.
+Buffer<float>& moment_workspace();
+
+// What a pass leaves to its backward, but for the cache.
+struct PassMemory {
+  VisibleSet visible;
+  TileLists active, merged;  // merged also receives the lists of a full pass
+  Buffer<uint32_t> contributed;
+  PixelTrace trace;
+  std::size_t bytes() const {
+    return visible.bytes() + active.bytes() + merged.bytes() + contributed.bytes() + trace.bytes();
+  }
+  void release();
+};
+
 class Rasterizer {
  public:
   // What there is to work with. `passed` (a forward whose backward may follow) offers what `cached` does, `frozen` too,
@@ -93,6 +109,10 @@ class Rasterizer {
   Rasterizer();
   ~Rasterizer();
 
+  // While it lives (claim.hpp), passes work in memory that many rasterisers may use one after the other, and no other
+  // thread may use this one. No backward may follow.
+  class Loan;
+
   // Forward passes return Fault bits; if any is set nothing was rendered and the cache is as before (active) or empty.
   // The arrays of `scene` are read again by the matching backward.
   uint32_t forward(const Scene& scene, const Camera& camera, const uint8_t* mask, const Target& target);
@@ -114,7 +134,7 @@ class Rasterizer {
   // are, ascending, and their gradients [K,2]; it may follow once.
   std::size_t backward_cached_rows(const Scene& scene, const float* image_gradient);
   void reached_rows(int64_t* rows, float* means2d_gradient) const;
-  std::size_t reached_count() const { return screen_.count; }
+  std::size_t reached_count() const { return reached_count_; }
   // out [N]: 1 for the rows of the cached scene that touch a cached tile.
   void visible_in_cache(uint8_t* out) const;
   // out [N]: 1 for the rows of the cached scene that added light to a pixel of a wanted tile. Costs follow these tiles,
@@ -145,8 +165,8 @@ class Rasterizer {
 
   // Tiles rendered by the last forward_active or forward_layered.
   const TileSelection& touched() const { return touched_; }
-  const VisibleSet& visible() const { return visible_; }
-  std::size_t pair_count() const { return visible_.pair_count; }
+  const VisibleSet& visible() const { return pass_->visible; }
+  std::size_t pair_count() const { return pass_->visible.pair_count; }
   std::size_t entry_count() const { return entry_count_; }
   std::size_t scene_count() const { return scene_count_; }
   std::size_t active_count() const { return active_rows_.size(); }
@@ -167,7 +187,6 @@ class Rasterizer {
   TileSelection cached_tiles(const uint8_t* mask, const char* operation) const;
 
   uint32_t project(const Scene& scene, const TileSelection& selection, Record* records);
-  void join_chunks(std::size_t chunks);
   bool set_active(const uint32_t* active, std::size_t count, const char* name);
   std::vector<uint8_t> tiles_of_active() const;
   uint32_t list_active(const Scene& rows, const TileSelection& selection);
@@ -191,7 +210,7 @@ class Rasterizer {
   const ProjectKernels& project_kernels_;
   const ProjectBackwardKernels& project_backward_kernels_;
   const CompositeKernels& composite_kernels_;
-  std::atomic<bool> busy_{false};
+  std::atomic<std::thread::id> owner_{};  // the thread that runs a call
   uint64_t passes_ = 0;
   State state_ = State::empty;
 
@@ -203,14 +222,11 @@ class Rasterizer {
   TileSelection touched_;  // of the last active pass
   std::vector<uint32_t> dropped_blocks_;  // that the active rows touch in the cache
 
-  std::unique_ptr<ProjectChunk[]> chunks_;
-  std::size_t chunk_capacity_ = 0;
-  VisibleSet visible_;
-  Buffer<DepthItem> sort_scratch_;
-  Buffer<uint32_t> contributed_;
-  PixelTrace trace_;
-  Buffer<float> moments_, screen_gradient_;
-  ScreenPass screen_;
+  PassMemory own_;
+  PassMemory* pass_ = &own_;  // or that of a loan
+  Buffer<uint32_t> reached_rows_;  // of the last backward_cached_rows, and their gradients
+  Buffer<float> reached_gradient_;
+  std::size_t reached_count_ = 0;
 
   // The cache: records of all Gaussians (then of the active rows), depth-sorted lists of the whole scene, what its
   // forward left at the pixels, and who is visible.
@@ -221,7 +237,7 @@ class Rasterizer {
   TileStore cached_lists_;
   PixelTrace cached_trace_;
   RowSet cached_visible_;
-  TileLists frozen_lists_, active_lists_, merged_lists_;  // merged_lists_ also receives the lists of a full pass
+  TileLists frozen_lists_;
   std::vector<uint32_t> active_rows_;
   std::vector<uint8_t> is_active_;
   ActiveEntries active_in_cache_;

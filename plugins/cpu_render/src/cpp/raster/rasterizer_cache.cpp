@@ -9,9 +9,26 @@
 #include "raster/rasterizer.hpp"
 
 namespace gsstream_cpu {
+namespace {
+
+ScreenPass& screen_workspace() {
+  thread_local ScreenPass own;
+  return own;
+}
+
+}  // namespace
+
+void PassMemory::release() {
+  visible.release();
+  active.release();
+  merged.release();
+  contributed.release();
+  trace.transmittance.release();
+  trace.last.release();
+}
 
 uint32_t Rasterizer::update(const uint32_t* changed, const Scene& rows, const Target& target) {
-  const Claim claim(busy_);
+  const Claim claim(owner_);
   expect("update");
   set_active(changed, rows.count, "update: changed");
   drop_layers();
@@ -22,10 +39,10 @@ uint32_t Rasterizer::update(const uint32_t* changed, const Scene& rows, const Ta
   std::vector<uint32_t> touched;
   before.find(cached_lists_.view(), tiles_of_active(), is_active_);
   before.touched(cached_lists_.view(), touched);
-  add_touched_blocks(active_lists_, touched);
+  add_touched_blocks(pass_->active, touched);
   replace_tiles(touched);
   for (uint32_t row : active_rows_) cached_visible_.erase(row);
-  for (std::size_t i = 0; i < visible_.count; i++) cached_visible_.insert(active_rows_[visible_.rows[i]]);
+  for (std::size_t i = 0; i < pass_->visible.count; i++) cached_visible_.insert(active_rows_[pass_->visible.rows[i]]);
   touched_.restrict(cached_selection_, touched);
   CompositeJob job =
       composite_job(cached_lists_.view(), touched_, target, cached_lists_.contributed.data(), cached_trace_);
@@ -35,7 +52,7 @@ uint32_t Rasterizer::update(const uint32_t* changed, const Scene& rows, const Ta
   return 0;
 }
 
-// Merges active_lists_ into the cached lists of the changed tiles, by (depth, row), then their records into the cache.
+// Merges pass_->active into the cached lists of the changed tiles, by (depth, row), then their records into the cache.
 // What the last forward left of blocks that do not change is carried over.
 void Rasterizer::replace_tiles(const std::vector<uint32_t>& changed_blocks) {
   const uint32_t base = static_cast<uint32_t>(scene_count_);
@@ -51,18 +68,18 @@ void Rasterizer::replace_tiles(const std::vector<uint32_t>& changed_blocks) {
     for (std::vector<uint32_t>* values : {&blocks, &contributed}) values->clear();
     entries.clear();
     place.assign(cached_lists_.end[tile] - cached_lists_.begin[tile], 0);
-    uint32_t a = active_lists_.offset[tile], c = cached_lists_.begin[tile];
-    const uint32_t a_end = active_lists_.offset[tile + 1], c_end = cached_lists_.end[tile];
+    uint32_t a = pass_->active.offset[tile], c = cached_lists_.begin[tile];
+    const uint32_t a_end = pass_->active.offset[tile + 1], c_end = cached_lists_.end[tile];
     for (;;) {
       while (c < c_end && is_active_[cached_lists_.entries[c].record]) c++;
       if (a == a_end && c == c_end) break;
       const bool take_active =
-          c == c_end || (a < a_end && in_front(active_lists_.entries[a].record, cached_lists_.entries[c].record));
-      const uint32_t record = take_active ? active_lists_.entries[a].record : cached_lists_.entries[c].record;
+          c == c_end || (a < a_end && in_front(pass_->active.entries[a].record, cached_lists_.entries[c].record));
+      const uint32_t record = take_active ? pass_->active.entries[a].record : cached_lists_.entries[c].record;
       if (!take_active) place[c - cached_lists_.begin[tile]] = static_cast<uint32_t>(entries.size());
       entries.push_back({row_of(record), FROZEN});
       contributed.push_back(take_active ? 0 : cached_lists_.contributed[c] & ~changed_blocks[tile]);
-      blocks.push_back(take_active ? active_lists_.blocks[a++] : cached_lists_.blocks[c++]);
+      blocks.push_back(take_active ? pass_->active.blocks[a++] : cached_lists_.blocks[c++]);
     }
     renumber_last(tile, changed_blocks[tile], place);
     cached_lists_.replace(tile, entries, blocks, contributed);
@@ -81,24 +98,24 @@ void Rasterizer::renumber_last(std::size_t tile, uint32_t changed, const std::ve
 }
 
 void Rasterizer::backward_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient) {
-  const Claim claim(busy_);
+  const Claim claim(owner_);
   expect("backward_cached");
   differentiate_cached(scene, image_gradient, means2d_gradient, false);
 }
 
 std::size_t Rasterizer::backward_cached_rows(const Scene& scene, const float* image_gradient) {
-  const Claim claim(busy_);
+  const Claim claim(owner_);
   expect("backward_cached");
   differentiate_cached(scene, image_gradient, nullptr, true);
-  return screen_.count;
+  return reached_count_;
 }
 
 void Rasterizer::reached_rows(int64_t* rows, float* means2d_gradient) const {
-  std::copy_n(screen_.rows.data(), screen_.count, rows);
-  std::copy_n(screen_gradient_.data(), 2 * screen_.count, means2d_gradient);
+  std::copy_n(reached_rows_.data(), reached_count_, rows);
+  std::copy_n(reached_gradient_.data(), 2 * reached_count_, means2d_gradient);
 }
 
-// Where `compact`, the gradients of the reached rows are left in screen_gradient_.
+// Where `compact`, the gradients of the reached rows and which they are, are kept for reached_rows.
 void Rasterizer::differentiate_cached(const Scene& scene, const float* image_gradient, float* means2d_gradient,
                                       bool compact) {
   if (scene.count != scene_count_)
@@ -107,10 +124,12 @@ void Rasterizer::differentiate_cached(const Scene& scene, const float* image_gra
   TileSelection reached, wanted;
   select_nonzero(image_gradient, camera_.width, camera_.height, reached);
   wanted.restrict(cached_selection_, reached.blocks);
-  screen_.build(cached_lists_, wanted, scene_count_);
+  ScreenPass& screen = screen_workspace();
+  Buffer<float>& moments = moment_workspace();
+  screen.build(cached_lists_, wanted, scene_count_);
   CompositeJob job{};
   job.records = records_.data();
-  job.lists = {cached_lists_.begin.data(), cached_lists_.end.data(), screen_.entries.data(),
+  job.lists = {cached_lists_.begin.data(), cached_lists_.end.data(), screen.entries.data(),
                cached_lists_.blocks.data()};
   job.tiles = wanted.active.data();
   job.tile_blocks = wanted.blocks.data();
@@ -122,18 +141,21 @@ void Rasterizer::differentiate_cached(const Scene& scene, const float* image_gra
   job.pixel_transmittance = cached_trace_.transmittance.data();
   job.pixel_last = cached_trace_.last.data();
   const CompositeBackwardJob raster{job, image_gradient, nullptr,
-                                    moments_.require(screen_.pair_count * MOMENT_STRIDE)};
+                                    moments.require(screen.pair_count * MOMENT_STRIDE)};
   parallel_for(wanted.active.size(), TILE_GRAIN,
                [&](std::size_t begin, std::size_t end) { composite_kernels_.backward(raster, begin, end); });
-  if (compact)
-    means2d_gradient = screen_gradient_.require(2 * screen_.count);
-  else
+  if (compact) {
+    reached_count_ = screen.count;
+    std::copy_n(screen.rows.data(), screen.count, reached_rows_.require(screen.count));
+    means2d_gradient = reached_gradient_.require(2 * screen.count);
+  } else {
     std::fill_n(means2d_gradient, 2 * scene_count_, 0.0f);
+  }
   GradientArrays out{};
   out.means2d = means2d_gradient;
-  const ProjectBackwardJob rows{scene.arrays,           camera_,         screen_.count, screen_.rows.data(),
-                                screen_.offset.data(),  moments_.data(), out,           compact};
-  parallel_for(screen_.count, BACKWARD_GRAIN, [&](std::size_t begin, std::size_t end) {
+  const ProjectBackwardJob rows{scene.arrays,           camera_,         screen.count, screen.rows.data(),
+                                screen.offset.data(),  moments.data(), out,           compact};
+  parallel_for(screen.count, BACKWARD_GRAIN, [&](std::size_t begin, std::size_t end) {
     project_backward_kernels_.backward[scene.sh_degree](rows, begin, end);
   });
 }
@@ -149,7 +171,7 @@ void Rasterizer::contributing_in_cache(const uint8_t* mask, uint8_t* out) {
 }
 
 void Rasterizer::add_drawn(const uint8_t* mask, uint8_t* out) {
-  const Claim claim(busy_);
+  const Claim claim(owner_);
   const TileSelection wanted = cached_tiles(mask, "contributing_in_cache");
   for (uint32_t tile : wanted.active)
     for (uint32_t e = cached_lists_.begin[tile]; e < cached_lists_.end[tile]; e++)
@@ -158,25 +180,15 @@ void Rasterizer::add_drawn(const uint8_t* mask, uint8_t* out) {
 }
 
 void Rasterizer::free_scratch() {
-  const Claim claim(busy_);
+  const Claim claim(owner_);
   if (state_ != State::empty) state_ = State::cached;
-  chunks_.reset();
-  chunk_capacity_ = 0;
-  for (Buffer<uint32_t>* buffer : {&visible_.rows, &visible_.pair_offset, &contributed_}) buffer->release();
-  visible_.pairs.release();
-  visible_.by_depth.release();
-  visible_.count = visible_.pair_count = 0;
-  sort_scratch_.release();
-  moments_.release();
-  screen_gradient_.release();
+  own_.release();
+  reached_rows_.release();
+  reached_gradient_.release();
+  reached_count_ = 0;
   drop_layers();
   layers_.release();
-  for (TileLists* lists : {&frozen_lists_, &active_lists_, &merged_lists_}) {
-    lists->tiles = lists->size = 0;
-    lists->offset.release();
-    lists->entries.release();
-    lists->blocks.release();
-  }
+  frozen_lists_.release();
 }
 
 std::size_t Rasterizer::cache_bytes() const {
@@ -184,14 +196,9 @@ std::size_t Rasterizer::cache_bytes() const {
 }
 
 std::size_t Rasterizer::memory_bytes() const {
-  std::size_t bytes = cache_bytes() + visible_.bytes() + sort_scratch_.bytes() + contributed_.bytes() + trace_.bytes() +
-                      moments_.bytes() + screen_gradient_.bytes() + screen_.bytes() + active_rows_.capacity() * sizeof(uint32_t) +
-                      is_active_.capacity() + active_in_cache_.bytes() + layers_.bytes() +
-                      layer_pixels_.capacity() * sizeof layer_pixels_[0];
-  for (const TileLists* lists : {&frozen_lists_, &active_lists_, &merged_lists_}) bytes += lists->bytes();
-  for (std::size_t c = 0; c < chunk_capacity_; c++)
-    bytes += sizeof(ProjectChunk) + chunks_[c].pairs.capacity * sizeof(Pair);
-  return bytes;
+  return cache_bytes() + own_.bytes() + reached_rows_.bytes() + reached_gradient_.bytes() +
+         active_rows_.capacity() * sizeof(uint32_t) + is_active_.capacity() + active_in_cache_.bytes() +
+         layers_.bytes() + layer_pixels_.capacity() * sizeof layer_pixels_[0] + frozen_lists_.bytes();
 }
 
 }  // namespace gsstream_cpu

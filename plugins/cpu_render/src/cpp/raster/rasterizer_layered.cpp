@@ -8,13 +8,13 @@
 namespace gsstream_cpu {
 
 uint32_t Rasterizer::forward_layered(const Scene& rows, const Target& target, const uint8_t* mask) {
-  const Claim claim(busy_);
+  const Claim claim(owner_);
   expect("forward_layered");
   const uint32_t faults = begin_active(rows, true, mask);
   if (faults) return faults;
   settle_layers(target.background);
   const TileListsView lists = place_layered_lists();
-  job_ = composite_job(lists, touched_, target, contributed_.require(entry_count_), trace_);
+  job_ = composite_job(lists, touched_, target, pass_->contributed.require(entry_count_), pass_->trace);
   job_.layers = layer_pixels_.data();
   parallel_for(touched_.active.size(), TILE_GRAIN, [&](std::size_t begin, std::size_t end) {
     for (std::size_t slot = begin; slot < end; slot++) merge_layered_tile(touched_.active[slot]);
@@ -36,7 +36,7 @@ void Rasterizer::settle_layers(const float* background) {
     std::copy_n(background, 3, layer_background_);
   }
   const LayerSource source{&composite_kernels_, records_.data(), cached_lists_.view(), &active_in_cache_,
-                           &active_lists_,      touched_.tiles_x, {background[0], background[1], background[2]}};
+                           &pass_->active,      touched_.tiles_x, {background[0], background[1], background[2]}};
   layer_pixels_.assign(tiles, nullptr);
   parallel_for(touched_.active.size(), TILE_GRAIN, [&](std::size_t begin, std::size_t end) {
     for (std::size_t slot = begin; slot < end; slot++) {
@@ -47,27 +47,27 @@ void Rasterizer::settle_layers(const float* background) {
   });
 }
 
-// Room in merged_lists_ for what lies between the layers of each touched tile and for the active entries.
+// Room in pass_->merged for what lies between the layers of each touched tile and for the active entries.
 TileListsView Rasterizer::place_layered_lists() {
   const std::size_t tiles = touched_.blocks.size();
   std::size_t total = 0;
-  uint32_t* offset = merged_lists_.offset.require(tiles + 1);
+  uint32_t* offset = pass_->merged.offset.require(tiles + 1);
   for (std::size_t tile = 0; tile < tiles; tile++) {
     offset[tile] = static_cast<uint32_t>(total);
     if (touched_.blocks[tile])
-      total += layers_[tile].size + active_lists_.offset[tile + 1] - active_lists_.offset[tile];
+      total += layers_[tile].size + pass_->active.offset[tile + 1] - pass_->active.offset[tile];
   }
   offset[tiles] = static_cast<uint32_t>(total);
-  merged_lists_.resize(tiles, total);
+  pass_->merged.resize(tiles, total);
   entry_count_ = total;
-  return merged_lists_.view();
+  return pass_->merged.view();
 }
 
 void Rasterizer::merge_layered_tile(std::size_t tile) {
   const TileLayers& between = layers_[tile];
-  merge_tile({between.entries.data(), between.blocks.data(), between.size}, active_lists_.slice(tile),
-             {records_.data(), static_cast<uint32_t>(scene_count_), active_rows_.data()}, merged_lists_,
-             merged_lists_.offset[tile]);
+  merge_tile({between.entries.data(), between.blocks.data(), between.size}, pass_->active.slice(tile),
+             {records_.data(), static_cast<uint32_t>(scene_count_), active_rows_.data()}, pass_->merged,
+             pass_->merged.offset[tile]);
 }
 
 }  // namespace gsstream_cpu

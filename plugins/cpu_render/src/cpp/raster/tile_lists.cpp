@@ -37,6 +37,21 @@ void TileLists::resize(std::size_t tile_count, std::size_t entry_count) {
   blocks.require(entry_count);
 }
 
+void TileLists::release() {
+  tiles = size = 0;
+  offset.release();
+  entries.release();
+  blocks.release();
+}
+
+void VisibleSet::release() {
+  count = pair_count = 0;
+  rows.release();
+  pair_offset.release();
+  pairs.release();
+  by_depth.release();
+}
+
 void TileLists::swap(TileLists& other) {
   std::swap(tiles, other.tiles);
   std::swap(size, other.size);

@@ -18,6 +18,7 @@ struct VisibleSet {
   Buffer<Pair> pairs;            // [pair_count]
   Buffer<DepthItem> by_depth;    // [count], slots; memory order until sorted
   std::size_t bytes() const { return rows.bytes() + pair_offset.bytes() + pairs.bytes() + by_depth.bytes(); }
+  void release();
 };
 
 // The list of one tile.
@@ -38,6 +39,7 @@ struct TileLists {
   }
   std::size_t bytes() const { return offset.bytes() + entries.bytes() + blocks.bytes(); }
   void resize(std::size_t tile_count, std::size_t entry_count);
+  void release();
   void swap(TileLists& other);
 };
 

@@ -14,14 +14,15 @@ inline const uint8_t* mask_data(const std::optional<ByteArray>& mask, int width,
   return mask->data();
 }
 
-inline Target make_target(const ConstFloatArray& background, const FloatArray& image, const FloatArray& transmittance,
-                          int width, int height) {
+// Without `transmittance` it is not written.
+inline Target make_target(const ConstFloatArray& background, const FloatArray& image,
+                          const std::optional<FloatArray>& transmittance, int width, int height) {
   const std::size_t w = static_cast<std::size_t>(width), h = static_cast<std::size_t>(height);
   require_shape(background, {3}, "background");
   require_shape(image, {h, w, 3}, "image");
-  require_shape(transmittance, {h, w}, "transmittance");
+  if (transmittance) require_shape(*transmittance, {h, w}, "transmittance");
   const float* b = background.data();
-  return {{b[0], b[1], b[2]}, image.data(), transmittance.data()};
+  return {{b[0], b[1], b[2]}, image.data(), transmittance ? transmittance->data() : nullptr};
 }
 
 }  // namespace gsstream_cpu

@@ -1,5 +1,6 @@
 // What all cameras of a rig do with their caches, at the same time: each view is one thread's, so that nobody waits
 // within a view. The same bits as one after the other.
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
@@ -22,7 +23,7 @@ namespace nb = nanobind;
 namespace gsstream_cpu {
 namespace {
 
-using Updated = std::tuple<nb::object, FloatArray, FloatArray>;  // rasteriser, image, transmittance
+using Updated = std::tuple<nb::object, FloatArray, std::optional<FloatArray>>;  // rasteriser, image, transmittance
 using Asked = std::tuple<nb::object, ByteArray>;                 // rasteriser, tiles
 
 // Fault bits of all views. Views without a fault are changed, also where another one has a fault.

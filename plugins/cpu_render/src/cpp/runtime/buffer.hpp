@@ -1,5 +1,11 @@
 // Uninitialised, cache-line aligned array that only grows: scratch that lives as long as its Rasterizer.
+//
+// Large ones are pages of their own and not part of the heap: the heap's large blocks come and go with the temporary
+// pictures of every frame, and what lives long between them would keep it from being used again (a tenth of the memory
+// of a run with large pictures).
 #pragma once
+#include <sys/mman.h>
+
 #include <cstddef>
 #include <cstdlib>
 #include <cstring>
@@ -17,7 +23,7 @@ class Buffer {
   Buffer() = default;
   Buffer(const Buffer&) = delete;
   Buffer& operator=(const Buffer&) = delete;
-  ~Buffer() { std::free(data_); }
+  ~Buffer() { give_back(); }
 
   // At least `count` items; contents are lost when it has to grow.
   T* require(std::size_t count) {
@@ -30,7 +36,7 @@ class Buffer {
     return data_;
   }
   void release() {
-    std::free(data_);
+    give_back();
     data_ = nullptr;
     capacity_ = 0;
   }
@@ -47,13 +53,30 @@ class Buffer {
  private:
   void reallocate(std::size_t count, std::size_t keep) {
     const std::size_t capacity = count + count / 4 + 64;
-    const std::size_t size = (capacity * sizeof(T) + 63) / 64 * 64;
-    T* fresh = static_cast<T*>(std::aligned_alloc(64, size));
-    if (!fresh) throw std::bad_alloc();
+    T* fresh = static_cast<T*>(allocate(capacity * sizeof(T)));
     if (keep) std::memcpy(fresh, data_, keep * sizeof(T));
-    std::free(data_);
+    give_back();
     data_ = fresh;
     capacity_ = capacity;
+  }
+
+  static bool is_large(std::size_t bytes) { return bytes >= std::size_t{1} << 20; }
+
+  static void* allocate(std::size_t bytes) {
+    if (!is_large(bytes)) {
+      if (void* found = std::aligned_alloc(64, (bytes + 63) / 64 * 64)) return found;
+      throw std::bad_alloc();
+    }
+    void* found = mmap(nullptr, bytes, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+    if (found == MAP_FAILED) throw std::bad_alloc();
+    return found;
+  }
+
+  void give_back() {
+    if (!is_large(bytes()))
+      std::free(data_);
+    else
+      munmap(data_, bytes());
   }
 
   T* data_ = nullptr;

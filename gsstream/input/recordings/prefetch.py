@@ -7,11 +7,14 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from types import TracebackType
+from typing import Any
+
+import numpy as np
 
 from gsstream.core.errors import EndOfRecording, GsstreamError, InputError, SourceError
 from gsstream.core.frame import Frame
 from gsstream.core.storage import Storage, packed
-from gsstream.input.recordings.base import FrameSource, LiveSource
+from gsstream.input.recordings.base import FrameSource, LiveSource, SingleImages
 from gsstream.input.recordings.canonical import to_file_coordinates
 
 FramePair = tuple[Frame, Frame]
@@ -98,8 +101,30 @@ def _pair_bytes(source: FrameSource) -> int:
     return sum(12 * len(rig) * rig.width * rig.height for rig in (source.info.train, source.info.test))
 
 
+def _packed_views(source: FrameSource, index: int, storage: Storage) -> Any:
+    """[C, H, W, 3] uint8: the training images read and packed one by one, so that no whole frame is float32 on the way.
+
+    None where a source cannot read single images, or bytes do not hold them.
+    """
+    single, cameras = to_file_coordinates(source), source.info.train
+    if storage == "float32" or not isinstance(single, SingleImages) or isinstance(single, LiveSource):
+        return None
+    views = np.empty((len(cameras), cameras.height, cameras.width, 3), np.uint8)
+    for out, name in zip(views, cameras.ids, strict=True):
+        view = packed(single.image(index, name), storage)
+        if view.dtype != np.uint8 or view.shape != out.shape:
+            return None
+        out[...] = view
+    return views
+
+
 def _read_pair(source: FrameSource, index: int, storage: Storage) -> FramePair:
     try:
+        views = _packed_views(source, index, storage)
+        if views is not None:
+            # All but the images is that of the test cameras' frame of the same instant.
+            test = source.frame(index, "test")
+            return replace(test, images=views, cameras=source.info.train), test
         train = source.frame(index, "train")
         pair = replace(train, images=packed(train.images, storage)), source.frame(index, "test")
     except GsstreamError:

@@ -11,6 +11,7 @@ import pytest
 
 from gsstream.core.errors import InputError, SourceError
 from gsstream.core.frame import Frame
+from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.base import SourceInfo, Split
 from gsstream.input.recordings.prefetch import Prefetcher
 from gsstream.input.recordings.synthetic import SyntheticSource
@@ -105,3 +106,45 @@ def test_closing_early_asks_for_nothing_more() -> None:
 def test_bounds_below_one_are_refused(depth: int, workers: int) -> None:
     with pytest.raises(InputError, match="must be at least 1"):
         Prefetcher(Watched(), range(3), depth=depth, workers=workers)
+
+
+class Singly:
+    """A recording of 8 bits that counts how it is read; ``shift`` takes its last camera off the levels of bytes."""
+
+    def __init__(self, shift: float = 0.0) -> None:
+        self._inner, self.wholes, self.singles = SyntheticSource.from_query("frames=3&views=3&width=24&height=16"), 0, 0
+        self.info, self._shift = self._inner.info, shift
+
+    def frame(self, index: int, split: Split = "train") -> Frame:
+        self.wholes += split == "train"
+        frame = self._inner.frame(index, split)
+        images = np.rint(frame.images * 255).astype(np.float32) / np.float32(255)
+        if split == "train":
+            images[-1] += self._shift
+        return replace(frame, images=images)
+
+    def image(self, index: int, camera: str) -> FloatArray:
+        self.singles += 1
+        wholes = self.wholes
+        image: FloatArray = self.frame(index).images[self.info.train.ids.index(camera)]
+        self.wholes = wholes
+        return image
+
+    def points(self, kind: str = "recording") -> None:
+        return None
+
+    def close(self) -> None: ...
+
+
+@pytest.mark.parametrize(("shift", "dtype", "wholes"), [(0.0, np.uint8, 0), (1e-3, np.float32, 3)])
+def test_bytes_are_read_camera_by_camera_and_other_images_whole(shift: float, dtype: type, wholes: int) -> None:
+    """Either way the frame is the one that the source gives."""
+    source, plain = Singly(shift), Singly(shift)
+    with Prefetcher(source, range(3), storage="auto") as frames:
+        for index, (train, test) in enumerate(frames):
+            want = plain.frame(index)
+            assert train.images.dtype == dtype
+            assert train.as_float32().images.tobytes() == want.images.tobytes()
+            assert (train.index, train.timestamp, train.cameras.ids) == (index, want.timestamp, want.cameras.ids)
+            assert test.images.tobytes() == plain.frame(index, "test").images.tobytes()
+    assert (source.wholes, source.singles) == (wholes, 9)

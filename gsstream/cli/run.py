@@ -59,8 +59,7 @@ def run(
     require_encoder()
     catalog = load_catalog()
     resolved = resolve_recipe(recipe.method, catalog.recipe_path, recipe.recipe or (), recipe.overrides())
-    server = server_beside(out, serve)
-    wanted, quiet = shown.wanted(), shown.quiet
+    server, wanted, quiet = server_beside(out, serve), shown.wanted(), shown.quiet
     say, named = _silent if quiet else _note, bool(recipe.method or recipe.recipe)
     with working("loading the method", quiet) as signs:
         # The slow imports come last: a mistake on the command line is answered at once.

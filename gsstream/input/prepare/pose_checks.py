@@ -53,8 +53,10 @@ def first_look(source: FrameSource) -> list[Finding]:
         return found[:1]
     try:
         frame = source.frame(0, "train")
-        blank = check_blank(Thumbnails(frame.images[None], train, len(train)))
-        return blank[:1] or check_poses(frame) or check_swapped(joined(frame, source.frame(0, "test"))) or found[:1]
+        if blank := check_blank(Thumbnails(frame.images[None], train, len(train))):
+            return blank[:1]
+        frame = _small(frame)
+        return check_poses(frame) or check_swapped(joined(frame, _small(source.frame(0, "test")))) or found[:1]
     except EndOfRecording:
         return found[:1]
 
@@ -74,7 +76,7 @@ def check_poses(frame: Frame) -> list[Finding]:
     """Find poses that explain the pictures of one instant much better when they are read by another convention."""
     if len(frame.cameras) < 3:
         return []
-    small = shrink_frame(frame, max(1, round(frame.cameras.width / WIDTH)))
+    small = _small(frame)
     images, cameras = small.images, small.cameras
     given = _agreement(images, cameras)
     if given >= AGREED:
@@ -96,7 +98,7 @@ def check_poses(frame: Frame) -> list[Finding]:
 
 def check_swapped(frame: Frame) -> list[Finding]:
     """Find two cameras that agree with the others only if each has the other's pose."""
-    small = shrink_frame(frame, max(1, round(frame.cameras.width / WIDTH)))
+    small = _small(frame)
     images, cameras = small.images, small.cameras
     count = len(cameras)
     if count < 4:
@@ -117,6 +119,11 @@ def check_swapped(frame: Frame) -> list[Finding]:
                 "fit with each other's pose; exchange their images or their poses"
             ))]  # fmt: skip
     return []
+
+
+def _small(frame: Frame) -> Frame:
+    """Pictures of about WIDTH pixels; a frame that is small stays as it is."""
+    return shrink_frame(frame, max(1, round(frame.cameras.width / WIDTH)))
 
 
 def _agreement(images: FloatArray, cameras: Cameras) -> float:

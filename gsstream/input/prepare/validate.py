@@ -82,7 +82,8 @@ def _stages(source: FrameSource, open_scene: Open, frames: int, features: bool) 
     yield check_overlap(train, train.ids)
     try:
         thumbs = _thumbnails(source, open_scene, rig, frames)
-        first = source.frame(0, "train"), source.frame(0, "test")
+        train_frame = source.frame(0, "train")
+        first = joined(train_frame, source.frame(0, "test"))
     except SourceError as fault:
         yield [error("images", str(fault))]
         return
@@ -90,15 +91,15 @@ def _stages(source: FrameSource, open_scene: Open, frames: int, features: bool) 
     yield check_same(thumbs)
     yield check_change(thumbs)
     # Before clocks: where poses do not fit, what moves seems to be at different places although clocks may be right.
-    yield check_poses(first[0])
+    yield check_poses(train_frame)
     clocks = check_sync(thumbs)
     if clocks and features:
         # The same for poses that are wrong in a way that no convention explains.
-        yield [finding for finding in _matched(joined(*first), rig_only=True) if finding.severity == "error"]
+        yield [finding for finding in _matched(first, rig_only=True) if finding.severity == "error"]
     yield clocks
-    yield check_swapped(joined(*first))
+    yield check_swapped(first)
     if features:
-        yield _matched(joined(*first))
+        yield _matched(first)
 
 
 def _thumbnails(source: FrameSource, open_scene: Open, rig: Cameras, frames: int) -> Thumbnails:

@@ -122,8 +122,8 @@ def check_swapped(frame: Frame) -> list[Finding]:
 
 
 def _small(frame: Frame) -> Frame:
-    """Pictures of about WIDTH pixels; a frame that is small stays as it is."""
-    return shrink_frame(frame, max(1, round(frame.cameras.width / WIDTH)))
+    """Pictures of about WIDTH pixels, float32; those of a frame that is small stay as they are."""
+    return shrink_frame(frame, max(1, round(frame.cameras.width / WIDTH))).as_float32()
 
 
 def _agreement(images: FloatArray, cameras: Cameras) -> float:

@@ -57,20 +57,14 @@ def encode(out: Path, *more: str, **options: Any) -> bytes:
     return (out / "stream.gss").read_bytes()
 
 
-def start(*command: str, **environment: str) -> subprocess.Popen[str]:
-    """``gsstream ...`` in a process of its own."""
-    code = "from gsstream.cli.main import main; main()"
-    return subprocess.Popen(
-        [sys.executable, "-c", code, *command], env={**os.environ, **environment}, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
-
-
 def finish(*command: str, **environment: str) -> tuple[int, str, str]:
-    """(exit code, stdout, stderr) of ``gsstream ...`` in a process of its own."""
-    with start(*command, **environment) as process:
-        out, err = process.communicate(timeout=600)
-    return process.returncode, out, err
+    """(exit code, stdout, stderr) of ``gsstream ...`` in a process that imports everything itself."""
+    code = "from gsstream.cli.main import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, *command], env={**os.environ, **environment}, capture_output=True, text=True,
+        timeout=600, check=False,
+    )  # fmt: skip
+    return done.returncode, done.stdout, done.stderr
 
 
 def demo_copy(

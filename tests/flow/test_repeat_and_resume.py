@@ -14,7 +14,8 @@ import time
 from pathlib import Path
 
 import pytest
-from flow_runs import WORLD, arguments, encode, finish, metrics, start
+from flow_runs import WORLD, arguments, encode, finish, metrics
+from forked import Forked, gsstream
 
 from gsstream.cli.main import run_command
 from gsstream.packet import StreamReader
@@ -49,15 +50,15 @@ def test_threads_change_no_byte(tmp_path: Path, whole: tuple[str, bytes]) -> Non
 def test_killed_at_any_moment_it_resumes_to_the_same_bytes(tmp_path: Path, whole: tuple[str, bytes]) -> None:
     method, once = whole
     out = tmp_path / "o"
-    process = start(*arguments(out, method=method))
+    process = Forked(arguments(out, method=method))
     wait_for((out / "stream.gss").exists, process)
     # From inside frame 0 to the last pictures. Not seeded on purpose: over time every moment is tried.
     delay = random.uniform(0, 2)
     time.sleep(delay)
     process.kill()
     process.communicate()
-    code, _, err = finish(*arguments(out, "--resume", method=method))
-    assert (code, err) == (0, "")
+    resumed = gsstream(arguments(out, "--resume", method=method))
+    assert (resumed.returncode, resumed.stderr) == (0, "")
     assert (out / "stream.gss").read_bytes() == once, f"killed after {delay} s"
     assert [line["frame"] for line in metrics(out)] == list(range(6))
 
@@ -124,7 +125,7 @@ def test_interrupt_ends_after_the_current_frame(tmp_path: Path) -> None:
     """Ctrl-C: code 130, a stream that plays, and --resume goes on to the bytes of an undisturbed run."""
     source, out = WORLD.replace("frames=6", "frames=40"), tmp_path / "o"
     options = {"source": source, "stream__epochs": 10}
-    process = start(*arguments(out, pictures=True, **options))
+    process = Forked(arguments(out, pictures=True, **options))
     wait_for((out / "metrics.jsonl").exists, process)
     os.kill(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=600)
@@ -146,7 +147,7 @@ ENDS = [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "ended by SIGTERM")]
 def test_before_the_first_packet_it_stops_at_once(tmp_path: Path, number: str, code: int, said: str) -> None:
     """Nothing would be lost, and frame 0 would take hours here."""
     out, options = tmp_path / "o", {"first_frame__max_iterations": 10_000_000, "first_frame__epochs": 10_000_000}
-    process = start(*arguments(out, **options))
+    process = Forked(arguments(out, **options))
     stream = out / "stream.gss"
     wait_for(lambda: stream.exists() and stream.stat().st_size > 0, process)
     os.kill(process.pid, getattr(signal, number))
@@ -158,7 +159,7 @@ def test_before_the_first_packet_it_stops_at_once(tmp_path: Path, number: str, c
 
 
 def test_interrupted_twice_it_does_not_wait_for_the_frame(tmp_path: Path) -> None:
-    process = start(*arguments(out := tmp_path / "o", stream__epochs=10_000))
+    process = Forked(arguments(out := tmp_path / "o", stream__epochs=10_000))
     wait_for((out / "metrics.jsonl").exists, process)
     for _ in range(2):
         os.kill(process.pid, signal.SIGINT)

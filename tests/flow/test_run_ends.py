@@ -11,7 +11,8 @@ from contextlib import redirect_stderr
 from pathlib import Path
 
 import pytest
-from flow_runs import arguments, demo_copy, encode, metrics, start
+from flow_runs import arguments, demo_copy, encode, metrics
+from forked import Forked
 
 from gsstream.cli.main import run_command
 from gsstream.packet import StreamReader
@@ -30,7 +31,7 @@ def until(path: Path, size: int, process) -> None:
 @pytest.mark.slow
 def test_a_service_ends_a_run_politely_and_a_second_run_is_kept_out(tmp_path, capsys) -> None:
     out = tmp_path / "o"
-    with start(*arguments(out, source=LONG)) as process:
+    with Forked(arguments(out, source=LONG)) as process:
         until(out / "stream.gss", 3000, process)
         os.kill(process.pid, signal.SIGSTOP)  # it must not come to its end while the second run is tried
         recipe = (out / "recipe.yaml").read_bytes()

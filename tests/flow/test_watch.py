@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from forked import Forked
 
 from gsstream.cli.main import run_command
 from gsstream.encode import to_rig_coordinates
@@ -23,7 +24,7 @@ from gsstream.packet import StreamReader
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from tests.flow import capture
-from tests.flow.flow_runs import TINY, arguments, demo_copy, encode, metrics, start
+from tests.flow.flow_runs import TINY, arguments, demo_copy, encode, metrics
 
 CAPTURE = Path(capture.__file__)
 FRAMES = 4
@@ -192,7 +193,7 @@ def test_interrupting_while_waiting_ends_at_once_and_resume_goes_on(
         for t in range(2):
             shutil.copy(finished / (camera["frames"] % t), live / (camera["frames"] % t))
     command = arguments(out, source=f"watch:{live}?timeout=60", **QUICK)
-    with start(*command) as process:
+    with Forked(command) as process:
         deadline = time.monotonic() + 50
         while not (out / "metrics.jsonl").exists() or len(metrics(out)) < 2:
             assert time.monotonic() < deadline, "two frames were not encoded in time"

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import Any
 
 import pytest
 from early_densify import densifying
+from forked import gsstream
 
 from gsstream.engine.frame0 import refine
 from gsstream.engine.run import session
@@ -27,27 +26,24 @@ REFINED: dict[str, Any] = {
 }
 QUICK = {"first_frame__max_iterations": 8, "first_frame__prune_error": 0, "stream__epochs": 1, "scale": 0.5}
 
-#: A program in which Gaussians are added early, as in the tests that run in this process.
+#: Gaussians are added early in another process, as in the tests that run in this one.
 EARLY = """
 from gsstream.engine.fit import schedule
 schedule.DENSIFY_FROM, schedule.DENSIFY_EVERY = 5, 4
-from gsstream.cli.main import main
 """
-#: ``gsstream`` that is killed, as from outside, at an iteration of a frame's refinement.
-DYING = f"""{EARLY}
-import os, signal, sys
+#: The process is killed, as from outside, at an iteration of a frame's refinement.
+DYING = """
+import os, signal
 from gsstream.engine.frame0 import refine
 
-frame, last = int(sys.argv.pop(1)), int(sys.argv.pop(1))
 step = refine.FirstFrameRun.step
 
 def dying(run, iteration):
-    if (run.frame.index, iteration) == (frame, last):
+    if (run.frame.index, iteration) == {}:
         os.kill(os.getpid(), signal.SIGKILL)
     return step(run, iteration)
 
 refine.FirstFrameRun.step = dying
-main()
 """
 
 
@@ -83,15 +79,14 @@ def test_a_run_killed_in_the_refinement_resumes_to_the_same_bytes(
 ) -> None:
     """Its packet is out and its line is not written; in the last frame the packet brings what the iterations make."""
     command = arguments(tmp_path, method="s2gs-edge", **REFINED)
-    killed = subprocess.run([sys.executable, "-c", DYING, str(frame), str(iteration), *command], check=False)
+    killed = gsstream(command, first=EARLY + DYING.format((frame, iteration)))
     assert killed.returncode == -9
     assert written(tmp_path / "stream.gss") == list(range(packets))
     assert [line["frame"] for line in metrics(tmp_path)] == list(range(frame))
     assert undisturbed.startswith((tmp_path / "stream.gss").read_bytes())
     if goes_on_from == "packets":  # then the iterations of all frames that the stream holds are made again
         (tmp_path / "metrics.jsonl").unlink()
-    again = [sys.executable, "-c", f"{EARLY}main()", *command, "--resume"]
-    done = subprocess.run(again, capture_output=True, text=True, check=False)
+    done = gsstream([*command, "--resume"], first=EARLY)
     assert done.returncode == 0, done.stderr
     told = f"frame {frame} of the stream is made again" in done.stderr
     assert told == (goes_on_from == "lines" and packets > frame)

@@ -31,11 +31,11 @@ def sources(site: Path) -> list[str]:
 def python(site: Path, *args: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """A fresh interpreter that has what was installed into ``site``."""
     path = os.pathsep.join([str(site), *sources(site), *filter(None, [os.environ.get("PYTHONPATH")])])
-    environment = {**os.environ, "PYTHONPATH": path, "PYTHONIOENCODING": "utf-8", "OMP_NUM_THREADS": "2"}
+    environment = {**os.environ, "PYTHONPATH": path, "PYTHONIOENCODING": "utf-8", "OMP_NUM_THREADS": "1"}
     command = [sys.executable, *args]
     return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=900, check=False)
 
 
 def gsstream(site: Path, *args: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """The command line in a fresh process that has torch."""
-    return forked.gsstream(args, path=[str(site), *sources(site)], cwd=cwd, env={**os.environ, "OMP_NUM_THREADS": "2"})
+    return forked.gsstream(args, path=[str(site), *sources(site)], cwd=cwd, env={**os.environ, "OMP_NUM_THREADS": "1"})

@@ -7,7 +7,7 @@ from typing import Any, final
 import torch
 from torch.nn.functional import conv2d, max_pool2d
 
-from gsstream.api import Loss
+from gsstream.api import Loss, LossTraits
 
 TILE, RADIUS = 16, 5
 C1, C2 = 0.01**2, 0.03**2
@@ -38,9 +38,10 @@ class ExampleLoss(Loss):
     """
 
     source = "3DGS (Kerbl et al. 2023)"
+    traits = LossTraits(takes_bytes=True)
 
     def prepare(self, target: torch.Tensor) -> Any:
-        return target
+        return target if target.is_floating_point() else target.float() / torch.tensor(255.0)
 
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None

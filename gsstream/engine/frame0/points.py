@@ -11,7 +11,8 @@ from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud, shrink_frame
 from gsstream.core.signs import Tell, silent
 from gsstream.engine.fit import schedule
-from gsstream.input.recordings.base import FrameSource, PointKind
+from gsstream.input.recordings.base import FrameSource, PointKind, SourceInfo
+from gsstream.input.recordings.depth_maps import read_depth_maps
 from gsstream.input.seeds.seeding import photo_consistent_seeds
 from gsstream.input.seeds.shell import shell_points
 from gsstream.input.seeds.thinning import thin_points
@@ -23,15 +24,18 @@ SWEEP_WIDTH = 160
 
 
 def gather_points(
-    shipped: Callable[[PointKind], PointCloud | None], frame: Frame, settings: FirstFrame, tell: Tell = silent
-) -> PointCloud:
+    shipped: Callable[[PointKind], PointCloud | None], frame: Frame, settings: FirstFrame, tell: Tell = silent,
+    info: SourceInfo | None = None,
+) -> PointCloud:  # fmt: skip
     """Return the points to seed from. Only the cameras of ``frame`` take part, and points that the source vouches for.
+
+    Where a plane sweep is made, it uses the recording's depth maps (``info.depth_maps``).
 
     Raises InputError when the recipe asks for a kind of points that the recording does not have, or finds none.
     """
     pixels = frame.images[..., 0].size
     limit = min(settings.max_points, max(1, pixels // schedule.PIXELS_PER_SEED))
-    return thin_points(_base_points(shipped, frame, settings, tell), limit)
+    return thin_points(_base_points(shipped, frame, settings, tell, info), limit)
 
 
 def with_test_views(source: FrameSource, frame: Frame) -> Frame:
@@ -50,13 +54,14 @@ def with_test_views(source: FrameSource, frame: Frame) -> Frame:
 
 
 def _base_points(
-    ships: Callable[[PointKind], PointCloud | None], frame: Frame, settings: FirstFrame, tell: Tell
-) -> PointCloud:
+    ships: Callable[[PointKind], PointCloud | None], frame: Frame, settings: FirstFrame, tell: Tell,
+    info: SourceInfo | None,
+) -> PointCloud:  # fmt: skip
     wanted = settings.points
     if wanted == "sfm":
         return _triangulate(frame, tell)
     if wanted == "sweep":
-        return _sweep(frame, settings, tell)
+        return _sweep(frame, settings, tell, info)
     shipped = ships("sparse" if wanted == "sparse" else "recording")
     if shipped is None and wanted != "auto":
         raise InputError(
@@ -66,7 +71,7 @@ def _base_points(
     if shipped is not None and (wanted != "auto" or len(shipped) >= SPARSE):
         return shipped
     try:
-        return _sweep(frame, settings, tell)
+        return _sweep(frame, settings, tell, info)
     except InputError:  # fewer than three cameras, or views that agree nowhere
         if shipped is not None:
             return shipped
@@ -81,7 +86,8 @@ def _triangulate(frame: Frame, tell: Tell) -> PointCloud:
     return triangulate_points(frame.images, frame.cameras, tell=tell)
 
 
-def _sweep(frame: Frame, settings: FirstFrame, tell: Tell) -> PointCloud:
+def _sweep(frame: Frame, settings: FirstFrame, tell: Tell, info: SourceInfo | None) -> PointCloud:
     """Points that several training views agree on, found at most SWEEP_WIDTH pixels wide (time grows with pixels)."""
     small = shrink_frame(frame, -(-frame.cameras.width // SWEEP_WIDTH))
-    return photo_consistent_seeds(small.images, small.cameras, settings.max_points, tell=tell).points
+    known = None if info is None else read_depth_maps(info.depth_maps, small.cameras, info.world.scale)
+    return photo_consistent_seeds(small.images, small.cameras, settings.max_points, known=known, tell=tell).points

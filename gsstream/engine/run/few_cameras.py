@@ -37,7 +37,7 @@ def expectation(cameras: Cameras) -> str:
     measured = AROUND if stands_around(cameras) else ONE_SIDE
     return (
         f"{number}{apart}: views between them will be soft or wrong where one camera sees alone (held-out views, "
-        f"measured: {measured}); more cameras in between help most, then points of the recording's own"
+        f"measured: {measured}); more cameras in between help most, then depth maps or points of the recording's own"
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
 from gsstream.core.cameras import Cameras
@@ -32,6 +33,7 @@ class SourceInfo:
         train, test: cameras by split; test cameras never enter seeding or training.
         licence: licence or terms of the recording, as text.
         world: where the coordinates of these cameras lie in those of the files; sources of files leave it alone.
+        depth_maps: folder of depth maps of frame 0 (:mod:`gsstream.input.recordings.depth_maps`); None: there is none.
     """
 
     name: str
@@ -42,6 +44,7 @@ class SourceInfo:
     test: Cameras
     licence: str = ""
     world: World = IDENTITY
+    depth_maps: Path | None = None
 
 
 class FrameSource(Protocol):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -57,4 +58,4 @@ def read_layout(name: str, folder: Path) -> Recording:
     if not folder.is_dir():
         raise SourceError(f"{folder}: no such folder; expected {LAYOUTS[name][1]}")
     recording: Recording = _reader(name).read(folder)
-    return recording
+    return replace(recording, folder=folder)

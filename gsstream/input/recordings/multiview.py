@@ -11,13 +11,16 @@ import numpy as np
 
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame, PointCloud
-from gsstream.core.shapes import FloatArray
+from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.input.recordings.base import FilesMissing, PointKind, SourceInfo, Split, check_index
 from gsstream.input.recordings.calibration import Calibration, frame_path, is_video, read_calibration
+from gsstream.input.recordings.depth_maps import FOLDER
 from gsstream.input.recordings.images import read_image
 from gsstream.input.recordings.sync import RecordingWarning
 
 POINTS_FILE = "points_frame0.npz"
+#: Points that whoever made them trusts less than this, from 0 to 1, are left out.
+TRUSTED = 0.5
 #: Steps of float32 above this share of the points' spread move them visibly.
 COARSE = 1e-3
 
@@ -50,6 +53,7 @@ class MultiviewSource:
             train=calibration.train.scaled(*self._target),
             test=calibration.test.scaled(*self._target),
             licence=calibration.licence,
+            depth_maps=self._folder / FOLDER,
         )
 
     @property
@@ -94,7 +98,10 @@ def scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
 
 
 def read_points(path: Path, kind: PointKind) -> PointCloud:
-    """Read [P, 3] points and uint8 colours from an npz file. Raises SourceError naming file and array."""
+    """Read [P, 3] points and uint8 colours from an npz file, without those of a ``confidence`` [P] below a half.
+
+    Raises SourceError naming file and array.
+    """
     prefix = "" if kind == "recording" else "sparse_"
     try:
         with np.load(path, allow_pickle=False) as arrays:
@@ -105,6 +112,7 @@ def read_points(path: Path, kind: PointKind) -> PointCloud:
             if missing:
                 raise SourceError(f"{path}: no array {missing[0]!r} for points {kind!r}; it holds {', '.join(names)}")
             xyz, rgb = arrays[f"{prefix}xyz"], arrays[f"{prefix}rgb"]
+            trust = arrays[f"{prefix}confidence"] if f"{prefix}confidence" in names else None
     except SourceError:
         raise
     except (OSError, ValueError, EOFError, TypeError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
@@ -128,8 +136,21 @@ def read_points(path: Path, kind: PointKind) -> PointCloud:
                 f"spread over {spread:.2g}: write float64, or move poses and points to the origin",
                 RecordingWarning, stacklevel=2,
             )  # fmt: skip
+    if trust is not None:
+        kept = _trusted(path, f"{prefix}confidence", trust, len(xyz))
+        xyz, rgb = xyz[kept], rgb[kept]
     colors = rgb.astype(np.float32) / np.float32(255)
     return PointCloud(xyz.astype(np.float64), colors, f"{path.name} ({kind})")
+
+
+def _trusted(path: Path, name: str, trust: FloatArray, count: int) -> BoolArray:
+    """[P] bool: which points their maker trusts. Raises SourceError for other numbers, and where none are left."""
+    if trust.shape != (count,) or trust.dtype.kind not in "fiu" or not ((trust >= 0) & (trust <= 1)).all():
+        raise SourceError(f"{path}: expected {name} [{count}] from 0 to 1, got {list(trust.shape)} {trust.dtype}")
+    kept: BoolArray = trust >= TRUSTED
+    if not kept.any():
+        raise SourceError(f"{path}: {name} is below {TRUSTED} for every point: scale it to 1, or leave the array out")
+    return kept
 
 
 def check_files(folder: Path, calibration: Calibration) -> None:

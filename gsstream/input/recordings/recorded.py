@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from gsstream.core.names import check_camera_ids
 from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.input.recordings.base import PointKind, SourceInfo, Split, check_index
 from gsstream.input.recordings.clips import Clip, prepare_command
+from gsstream.input.recordings.depth_maps import FOLDER
 from gsstream.input.recordings.distortion import Lens, Undistorter, pinhole_intrinsics
 from gsstream.input.recordings.multiview import scaled_size
 from gsstream.input.recordings.sync import align
@@ -41,6 +43,7 @@ class Recording:
         lenses: camera id -> distortion, where there is any.
         sizes: camera id -> (width, height) of its pictures; empty: all have those of the rig.
         points: reads points of frame 0; None when none ship.
+        folder: the recording's, in which it may keep what else is known of frame 0.
     """
 
     name: str
@@ -53,6 +56,7 @@ class Recording:
     sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     points: Callable[[], SeenPoints | None] = lambda: None
     licence: str = ""
+    folder: Path | None = None
 
 
 class RecordedSource:
@@ -87,6 +91,7 @@ class RecordedSource:
             train=flat.select(train),
             test=flat.select(test),
             licence=recording.licence,
+            depth_maps=None if recording.folder is None else recording.folder / FOLDER,
         )
 
     @property

@@ -17,6 +17,7 @@ from gsstream.core.frame import Arrival, Frame, PointCloud
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.base import PointKind, SourceInfo, Split
 from gsstream.input.recordings.calibration import CALIBRATION_FILE, Calibration, frame_path, is_video, read_calibration
+from gsstream.input.recordings.depth_maps import FOLDER
 from gsstream.input.recordings.images import read_image
 from gsstream.input.recordings.multiview import POINTS_FILE, read_points, scaled_size
 from gsstream.input.recordings.watch_options import WatchOptions
@@ -68,6 +69,7 @@ class WatchSource:
             train=calibration.train.scaled(*self._target),
             test=calibration.test.scaled(*self._target),
             licence=calibration.licence,
+            depth_maps=folder / FOLDER,
         )
         self._plans: dict[int, _Plan] = {}  # only frames that are not delivered whole
         self._next, self._skip_to, self._newest = 0, 0, 0

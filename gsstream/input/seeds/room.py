@@ -28,7 +28,7 @@ from gsstream.input.seeds.window import window_mean
 from gsstream.input.seeds.workers import one_thread_each
 
 #: Degrees between two cameras, seen from what all look at, above which a rig stands in the room that it looks into.
-AROUND = 120.0
+AROUND = 90.0
 #: Most cameras that a room is found by, and that a pixel's place is compared with: time grows with their pairs.
 MOST_CAMERAS = 8
 #: Deviation of grey that counts as texture, half width of the windows compared, and places that make a score count.
@@ -92,7 +92,7 @@ def stands_around(cameras: Cameras) -> bool:
 
 def with_room(
     images: FloatArray, cameras: Cameras, swept: FloatArray, depths: FloatArray, accepted: BoolArray,
-    tell: Tell = silent,
+    given: BoolArray, tell: Tell = silent,
 ) -> tuple[FloatArray, BoolArray]:  # fmt: skip
     """Return depths [C, H, W] of which those of the room stand in where the sweep is not sure, and which are seeds.
 
@@ -104,20 +104,21 @@ def with_room(
         swept: [C, H, W] depth that the sweep found, right or wrong.
         depths: [C, H, W] the same after interpolation where it was not sure.
         accepted: [C, H, W] bool, where enough views agree with ``depths``.
+        given: [C, H, W] bool, pixels of depth maps: they stay as they are.
     """
     support = agreement(swept, cameras, SUPPORT).support
     room = room_depths(find_room(images, cameras, tell), cameras)
     partners = neighbour_views(cameras, MOST_CAMERAS)
-    depths, kept = depths.copy(), accepted & (depths < IN_FRONT * room)
+    depths, kept = depths.copy(), accepted & (given | (depths < IN_FRONT * room))
     for view in range(len(cameras)):
         match = _match(images, cameras, view, swept[view], partners[view].tolist())
-        more = ~kept[view] & (swept[view] < CLEARLY_IN_FRONT * room[view]) & (support[view] >= 1)
+        more = ~given[view] & ~kept[view] & (swept[view] < CLEARLY_IN_FRONT * room[view]) & (support[view] >= 1)
         more &= match.best > CONFIRMED
         depths[view][more] = swept[view][more]
         kept[view] |= more
         wall = _match(images, cameras, view, room[view], partners[view].tolist())
         contradicted = wall.seen & (wall.best < CONTRADICTED) & (wall.texture > NOISE)
-        taken = ~kept[view] & ~contradicted
+        taken = ~given[view] & ~kept[view] & ~contradicted
         depths[view][taken] = room[view][taken]
         kept[view] |= taken
         tell("looking for points: walls compared", view + 1, len(cameras))

@@ -12,7 +12,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
 from gsstream.core.frame import PointCloud
-from gsstream.core.shapes import FloatArray, check_finite, check_shape
+from gsstream.core.shapes import BoolArray, FloatArray, check_finite, check_shape
 from gsstream.core.signs import Tell, silent
 from gsstream.input.seeds.fusion import agreement, color_gains, interpolate_depths, world_points
 from gsstream.input.seeds.room import stands_around, with_room
@@ -41,6 +41,7 @@ def photo_consistent_seeds(
     cameras: Cameras,
     count: int,
     *,
+    known: FloatArray | None = None,
     settings: SweepSettings | None = None,
     tolerance: float = 0.015,
     min_support: int = 2,
@@ -51,23 +52,31 @@ def photo_consistent_seeds(
 
     A rig that looks inwards from around stands in a room; where the sweep is not sure, points lie on its walls.
 
-    Raises InputError for fewer than three cameras and when no two views agree anywhere.
+    Arguments:
+        known: [C, H, W] planar depth of the recording's depth maps, NaN where nothing is known: what is known goes
+            before what is found, and where every camera has a map nothing is looked for.
+
+    Raises InputError for fewer than three cameras, unless all have a depth map, and when no two views agree anywhere.
     """
     check_shape("images", images, (len(cameras), cameras.height, cameras.width, 3))
     check_finite("images", images)
-    if len(cameras) < 3 or count < 1:
+    known = np.full(images.shape[:3], np.nan, np.float32) if known is None else known
+    given = np.isfinite(known)
+    maps = int(given.any((1, 2)).sum())
+    if (len(cameras) < 3 and maps < len(cameras)) or count < 1:
         raise InputError(
             f"photo-consistent seeds: expected at least 3 training cameras and count >= 1, got {len(cameras)} cameras "
             f"and count {count}; give the recording points, or use structure from motion"
         )
-    swept = sweep_depths(images, cameras, SweepSettings() if settings is None else settings, tell)
-    tell("looking for points: comparing what the cameras found", 0, 0)
-    sure = agreement(swept, cameras, tolerance).accepted(min_support, dominance)
-    if not sure.any():
-        raise InputError(
-            "photo-consistent seeds: no two views agree on any surface; check that the poses are world-to-camera with "
-            "OpenCV axes, that frame 0 is synchronised, and that the images are undistorted"
-        )
+    if maps == len(cameras):
+        swept, sure, origin = interpolate_depths(known, given), given, f"depth maps of {maps} cameras"
+    else:
+        swept = sweep_depths(images, cameras, settings or SweepSettings(), tell)
+        swept = np.where(given, known, swept)
+        tell("looking for points: comparing what the cameras found", 0, 0)
+        sure = given | agreement(swept, cameras, tolerance).accepted(min_support, dominance)
+        _check_agreement(sure)
+        origin = f"plane sweep of {len(cameras)} training views" + f", depth maps of {maps}" * bool(maps)
     gains = color_gains(images, swept, sure, cameras)
     depths = interpolate_depths(swept, sure)
     verdict = agreement(depths, cameras, tolerance)
@@ -76,15 +85,24 @@ def photo_consistent_seeds(
         sure, verdict.accepted(min_support, dominance), verdict.accepted(min_support, 2 * dominance)
     )
     confidence = verdict.support / np.maximum(verdict.support + verdict.violation, 1) * accepted
-    origin = f"plane sweep of {len(cameras)} training views"
+    accepted |= given
     if stands_around(cameras):
         origin += " and the room that they stand in"
-        depths, accepted = with_room(images, cameras, swept, depths, accepted, tell)
+        depths, accepted = with_room(images, cameras, swept, depths, accepted, given, tell)
     xyz = np.concatenate([world_points(depths, cameras, i)[accepted[i].reshape(-1)] for i in range(len(cameras))])
     common = np.clip(images / gains[:, None, None, :], 0, 1)
     cloud = PointCloud(xyz.astype(np.float32), common[accepted], origin)
     thinned, score = _thin_with_score(cloud, confidence[accepted].astype(np.float32), count)
     return PhotoSeeds(thinned, score, gains)
+
+
+def _check_agreement(sure: BoolArray) -> None:
+    """Raise InputError where the sweep is sure of no pixel [C, H, W] at all."""
+    if not sure.any():
+        raise InputError(
+            "photo-consistent seeds: no two views agree on any surface; check that the poses are world-to-camera with "
+            "OpenCV axes, that frame 0 is synchronised, and that the images are undistorted"
+        )
 
 
 def _thin_with_score(cloud: PointCloud, score: FloatArray, count: int) -> tuple[PointCloud, FloatArray]:

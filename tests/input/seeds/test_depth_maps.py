@@ -1,0 +1,150 @@
+"""Depth maps of a recording, and trust in its points: read from files, and what becomes of them in the seeds."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from rigs import HEIGHT, WIDTH, inwards
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.errors import InputError, SourceError
+from gsstream.encode import to_rig_coordinates
+from gsstream.engine.fit import schedule
+from gsstream.engine.frame0.points import gather_points
+from gsstream.input.recordings.depth_maps import read_depth_maps
+from gsstream.input.recordings.multiview import read_points
+from gsstream.input.recordings.open import open_source
+from gsstream.input.seeds.geometry import pixel_centers
+from gsstream.input.seeds.seeding import photo_consistent_seeds
+from gsstream.input.seeds.sweep import SweepSettings
+from gsstream.recipe.model import FirstFrame
+
+RING = inwards(5, 360)
+BALL, RADIUS = np.array([0.2, -0.1, 0.15]), 0.5
+
+
+def ball_depths(cameras: Cameras) -> np.ndarray:
+    """[C, H, W] planar depth of a ball, by the formula of a ray and a sphere; NaN beside it."""
+    pixels = pixel_centers(cameras.width, cameras.height)
+    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ np.linalg.inv(cameras.Ks[0]).T
+    depths = []
+    for view, start in enumerate(cameras.centers):
+        way = rays @ cameras.viewmats[view, :3, :3]
+        square, half = (way**2).sum(1), way @ (start - BALL)
+        inner = half**2 - square * ((start - BALL) @ (start - BALL) - RADIUS**2)
+        depths.append(np.where(inner > 0, (-half - np.sqrt(np.maximum(inner, 0))) / square, np.nan))
+    return np.reshape(depths, (len(cameras), cameras.height, cameras.width)).astype(np.float32)
+
+
+def test_seeds_lie_where_the_depth_maps_say_even_of_one_camera_alone() -> None:
+    images = np.random.default_rng(1).random((1, HEIGHT, WIDTH, 3)).astype(np.float32)
+    cameras = RING.select([0])
+    depths = ball_depths(cameras)
+    seeds = photo_consistent_seeds(images, cameras, 10_000, known=depths).points
+    assert len(seeds) == np.isfinite(depths).sum()
+    np.testing.assert_allclose(np.linalg.norm(seeds.xyz - BALL, axis=1), RADIUS, atol=1e-4)
+    with pytest.raises(InputError, match="at least 3 training cameras"):
+        photo_consistent_seeds(images, cameras, 100, known=np.full_like(depths, np.nan))
+
+
+def test_what_is_given_stays_and_the_others_are_looked_for() -> None:
+    images = np.random.default_rng(2).random((5, HEIGHT, WIDTH, 3)).astype(np.float32)
+    known = np.full((5, HEIGHT, WIDTH), np.nan, np.float32)
+    known[1, 10:30, 20:40] = 1.7
+    quick = SweepSettings(planes=16, neighbours=2)
+    found = photo_consistent_seeds(images, RING, 50_000, known=known, settings=quick).points
+    assert "depth maps of 1" in found.origin
+    local = found.xyz @ RING.viewmats[1, :3, :3].T + RING.viewmats[1, :3, 3]
+    assert (np.abs(local[:, 2] - 1.7) < 1e-4).sum() >= 20 * 20
+
+
+def write(folder: Path, unit: float = 1.0) -> Path:
+    """A recording of three cameras that see a ball, with its depth maps, in units of ``unit`` of the rig's metres."""
+    cameras, rng = RING.select([0, 1, 2]), np.random.default_rng(3)
+    depths = ball_depths(cameras)
+    (folder / "depth_frame0").mkdir(parents=True)
+    rows = []
+    for view, name in enumerate(cameras.ids):
+        picture = (255 * rng.random((HEIGHT, WIDTH, 3))).astype(np.uint8)
+        Image.fromarray(picture).save(folder / f"{name}.png")
+        np.save(folder / "depth_frame0" / f"{name}.npy", depths[view].astype(np.float64) / unit)
+        pose = cameras.viewmats[view].copy()
+        pose[:3, 3] /= unit
+        size = {"width": WIDTH, "height": HEIGHT, "split": "train", "frames": f"{name}.png"}
+        rows.append({"id": name, "K": cameras.Ks[view].tolist(), "w2c": pose.tolist(), **size})
+    text = {"schema": "opencv-multiview-1", "name": "ball", "fps": 30, "frames": 1, "cameras": rows}
+    (folder / "cameras.json").write_text(json.dumps(text))
+    return folder
+
+
+def test_depth_is_in_the_units_of_the_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(schedule, "PIXELS_PER_SEED", 1)  # the pictures are tiny
+    found = []
+    for unit in (1.0, 1e-3, 0.3048):
+        source = to_rig_coordinates(open_source(str(write(tmp_path / f"{unit}", unit))))
+        seeds = gather_points(source.points, source.frame(0), FirstFrame(), info=source.info)
+        assert seeds.origin.startswith("depth maps of 3 cameras")
+        found.append(source.info.world.points(seeds.xyz) * unit)
+    away = np.abs(np.linalg.norm(found[0] - BALL, axis=1) - RADIUS)
+    assert (away < 0.02).mean() > 0.1, "many pixels show the ball; thinning leaves more of the walls"
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], atol=1e-4)
+
+
+def test_maps_are_brought_to_the_size_of_the_pictures(tmp_path: Path) -> None:
+    deep = np.arange(1.0, 1 + 16 * HEIGHT * WIDTH).reshape(4 * HEIGHT, 4 * WIDTH)
+    deep[:4, :16], deep[:4, 16:32], deep[:4, 32:48] = 0, np.inf, 1e300
+    np.save(tmp_path / "cam0.npy", deep)
+    found = read_depth_maps(tmp_path, RING.select([0, 1]), unit=2.0)
+    assert found is not None
+    np.testing.assert_array_equal(found[0][1:], deep[6::4, 2::4].astype(np.float32) / 2)
+    assert np.isnan(found[0][0, :12]).all()
+    assert np.isfinite(found[0][0, 12:]).all()
+    assert np.isnan(found[1]).all(), "this camera has none"
+    assert read_depth_maps(tmp_path / "nowhere", RING) is None
+
+
+def text_file(path: Path) -> None:
+    path.write_text("no array")
+
+
+def array(values: np.ndarray) -> Callable[[Path], None]:
+    return lambda path: np.save(path, values)
+
+
+@pytest.mark.parametrize(
+    ("write_it", "message"),
+    [
+        (text_file, "cam0.npy: cannot be read as a numpy array"),
+        (array(np.zeros((HEIGHT, WIDTH, 1))), r"got \[48, 64, 1\] float64"),
+        (array(np.full((HEIGHT, WIDTH), "deep")), "expected planar depth"),
+        (array(np.zeros((0, 0))), "got 0 x 0"),
+        (array(np.zeros((HEIGHT, HEIGHT))), "got 48 x 48"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_named(
+    tmp_path: Path, write_it: Callable[[Path], None], message: str
+) -> None:
+    write_it(tmp_path / "cam0.npy")
+    with pytest.raises(SourceError, match=message):
+        read_depth_maps(tmp_path, RING)
+
+
+def test_points_that_their_maker_does_not_trust_are_left_out(tmp_path: Path) -> None:
+    xyz, rgb = np.arange(12.0).reshape(4, 3), np.arange(12, dtype=np.uint8).reshape(4, 3)
+    path = tmp_path / "points_frame0.npz"
+    np.savez(path, xyz=xyz, rgb=rgb, confidence=np.array([0.2, 0.9, 0.5, 0.49]))
+    np.testing.assert_array_equal(read_points(path, "recording").xyz, xyz[[1, 2]])
+    for wrong, message in (
+        (np.ones(3), r"expected confidence \[4\] from 0 to 1, got \[3\]"),
+        (np.array([0, 1, 2, 3.0]), "from 0 to 1"), (np.array([np.nan, 1, 1, 1]), "from 0 to 1"),
+        (np.full(4, 0.1), "below 0.5 for every point"),
+    ):  # fmt: skip
+        np.savez(path, xyz=xyz, rgb=rgb, confidence=wrong)
+        with pytest.raises(SourceError, match=message):
+            read_points(path, "recording")

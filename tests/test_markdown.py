@@ -357,7 +357,8 @@ def messages(path: Path) -> Iterator[str]:
 
 def test_commands_that_messages_name_parse() -> None:
     calls = {
-        call for root in ("gsstream", "plugins") for path in ROOT.glob(f"{root}/**/*.py") if "tests" not in path.parts
+        call for root in ("gsstream", "plugins") for path in ROOT.glob(f"{root}/**/*.py")
+        if "tests" not in path.relative_to(ROOT).parts
         for text in messages(path) for call in CALL.findall(text) if call.split()[1] not in VERBS
     }  # fmt: skip
     assert len(calls) > 12

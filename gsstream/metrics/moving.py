@@ -22,15 +22,20 @@ def moving_mask(image: FloatArray, first: FloatArray, sigma: float) -> Mask:
     """
     check_pair(image, first)
     threshold = max(4 * math.sqrt(2) * sigma, FLOOR)
-    moved: Mask = np.any(np.abs(np.asarray(image, np.float64) - first) > threshold, axis=-1)
-    return dilate(moved, DILATION)
+    return dilate(_differs(image, first, threshold), DILATION)
 
 
 def changed_mask(image: FloatArray, first: FloatArray) -> Mask:
     """Return [H, W] bool: some channel differs from frame 0 by more than 0.1; the bodies, without shadows and rims."""
     check_pair(image, first)
-    changed: Mask = np.any(np.abs(np.asarray(image, np.float64) - first) > CHANGED, axis=-1)
-    return changed
+    return _differs(image, first, CHANGED)
+
+
+def _differs(image: FloatArray, first: FloatArray, threshold: float) -> Mask:
+    """[H, W] bool: some channel differs by more than the threshold."""
+    difference: FloatArray = np.subtract(image, first, dtype=np.float64)
+    np.abs(difference, out=difference)
+    return np.asarray(np.any(difference > threshold, axis=-1))
 
 
 def dilate(mask: Mask, radius: int) -> Mask:

@@ -20,7 +20,8 @@ def psnr(image: FloatArray, target: FloatArray, mask: Mask | None = None) -> flo
     Returns inf for equal images, nan for an empty mask. Raises ShapeError when shapes disagree.
     """
     check_pair(image, target)
-    error = (np.asarray(image, np.float64) - target) ** 2
+    error: FloatArray = np.subtract(image, target, dtype=np.float64)
+    np.square(error, out=error)
     if mask is not None:
         if mask.shape != error.shape[:2]:
             raise ShapeError(f"mask: expected {list(error.shape[:2])}, got {list(mask.shape)}")

@@ -25,6 +25,8 @@ CLAIMS: dict[str, dict[str, Any]] = {
     "gate/always-open": {},
     "gate/binary-ste": {"stochastic": True, "differentiable": True, "temperature": True},
     "gate/gumbel-sigmoid": {"stochastic": True, "differentiable": True, "temperature": True},
+    "loss/cpu": {"takes_bytes": True},
+    "loss/reference": {},
     "propagation/ft-pruning": {"idempotent": True, "differentiable": True, "parent_bound": True},
     "propagation/group-max": {"conservative": True, "idempotent": True, "differentiable": True, "normalised": True},
     "propagation/hierarchical-max": {

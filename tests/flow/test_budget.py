@@ -108,10 +108,10 @@ def test_memory_limits_frame_0_or_refuses(tmp_path: Path, capsys: pytest.Capture
     command = arguments(tmp_path / "no", "--budget", "memory=100MB")
     assert run_command(command) == 2
     err = capsys.readouterr().err
-    assert "budget.memory: 100 MB, but a run of this recording needs at least 28" in err
+    assert "budget.memory: 100 MB, but a run of this recording needs at least 31" in err
     assert "give more, or lower --scale" in err
     assert not (tmp_path / "no" / "stream.gss").exists()
-    encode(tmp_path / "yes", "--budget", "memory=286MB", "--frames", "2")
+    encode(tmp_path / "yes", "--budget", "memory=316MB", "--frames", "2")
     recipe = metrics(tmp_path / "yes"), (tmp_path / "yes" / "recipe.yaml").read_text()
     assert all("memory" in line["budget"]["limits"] for line in recipe[0])
     with Playback(tmp_path / "yes" / "stream.gss") as playback:

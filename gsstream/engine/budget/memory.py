@@ -9,25 +9,29 @@ from dataclasses import replace
 from typing import Any
 
 from gsstream.core.errors import InputError
+from gsstream.core.picture_size import is_large
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.input.recordings.base import SourceInfo
+from gsstream.recipe.model import Recipe
 
 #: Interpreter, torch, the renderer and the engine with everything a run imports (measured, docs/results/trade.md).
-PROCESS = 280_000_000
-#: Copies of a training image, float32 RGB: two frames, two decoded ahead, the loss's target and its blurred moments,
-#: and what change is looked for in (measured on two recordings).
-IMAGE_COPIES = 12
-#: A Gaussian with its gradients and moments in frame 0, and the copies of a frame step.
-BYTES_PER_GAUSSIAN = 1_700
+PROCESS = 310_000_000
+#: Of a training image: the frame, the one before and two read ahead, which wait as bytes or float32.
+WAITING = 4
+#: What is made of images of one camera at a time, in images of float32: renders, gradients, maps of the loss, and the
+#: temporary ones of every phase (measured at widths of 320 and 1352, docs/results/trade.md).
+WORKING = 8
+#: A Gaussian with its gradients and moments in frame 0; and the copies of a frame step, when there are caches.
+BYTES_PER_GAUSSIAN, BYTES_PER_GAUSSIAN_LATER = 1_700, 700
 #: Share of the memory beside the images that Gaussians get; caches get the rest (250 bytes per camera and Gaussian).
 FOR_GAUSSIANS = 0.6
 #: With fewer Gaussians than this a scene is not worth encoding.
 MIN_GAUSSIANS = 1_000
 
 
-def min_memory(info: SourceInfo) -> int:
+def min_memory(info: SourceInfo, recipe: Recipe) -> int:
     """Return how many bytes a run of this recording needs with the least number of Gaussians."""
-    return _fixed(info) + round(MIN_GAUSSIANS * BYTES_PER_GAUSSIAN / FOR_GAUSSIANS)
+    return _fixed(info, recipe) + round(MIN_GAUSSIANS * BYTES_PER_GAUSSIAN / FOR_GAUSSIANS)
 
 
 def limit_memory(parts: Assembly, info: SourceInfo) -> Assembly:
@@ -40,18 +44,19 @@ def limit_memory(parts: Assembly, info: SourceInfo) -> Assembly:
     memory = parts.recipe.budget.memory
     if memory is None:
         return parts
-    if memory < min_memory(info):
+    least = min_memory(info, parts.recipe)
+    if memory < least:
         raise InputError(
             f"budget.memory: {memory / 1e6:.0f} MB, but a run of this recording needs at least "
-            f"{min_memory(info) / 1e6:.0f} MB ({PROCESS / 1e6:.0f} MB for the process, the rest for "
+            f"{least / 1e6:.0f} MB ({PROCESS / 1e6:.0f} MB for the process, the rest for "
             f"{len(info.train)} training cameras of {info.train.width} x {info.train.height} pixels and "
             f"{MIN_GAUSSIANS} Gaussians); give more, or lower --scale"
         )
-    free, first = memory - _fixed(info), parts.recipe.first_frame
+    free, first = memory - _fixed(info, parts.recipe), parts.recipe.first_frame
     most = min(first.max_gaussians, round(FOR_GAUSSIANS * free) // BYTES_PER_GAUSSIAN)
     recipe = parts.recipe.model_copy(update={"first_frame": first.model_copy(update={"max_gaussians": most})})
     parts = replace(parts, recipe=recipe)
-    return _with_cache(parts, (free - most * BYTES_PER_GAUSSIAN) / 1e6)
+    return _with_cache(parts, (free - most * BYTES_PER_GAUSSIAN_LATER) / 1e6)
 
 
 def _with_cache(parts: Assembly, megabytes: float) -> Assembly:
@@ -68,7 +73,10 @@ def _with_cache(parts: Assembly, megabytes: float) -> Assembly:
     return replace(parts, recipe=recipe, renderer=renderer)
 
 
-def _fixed(info: SourceInfo) -> int:
-    pixels = info.train.width * info.train.height
-    views = IMAGE_COPIES * len(info.train) + 4 * len(info.test)
-    return PROCESS + views * pixels * 12
+def _fixed(info: SourceInfo, recipe: Recipe) -> int:
+    # Images that are read at their own size are taken for 8-bit ones, as nearly all are.
+    bytes_wait = recipe.data.images == "uint8" or (recipe.data.images == "auto" and recipe.scale == 1)
+    waiting = WAITING / 4 if bytes_wait else WAITING + 1  # one frame is read before it is stored
+    statistics = 1 if is_large(info.train.width) else 2
+    images = (waiting + statistics) * len(info.train) + 4 * len(info.test) + WORKING
+    return PROCESS + round(images * 12 * info.train.width * info.train.height)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -182,6 +183,44 @@ def test_layers_count_as_memory() -> None:
     rendered = native.memory_bytes()
     fused(session, 0, whole.rows(active), comparison())
     assert native.memory_bytes() - rendered > pixels
+
+
+def test_a_fused_pass_leaves_layers_alone_in_the_memory_of_a_view() -> None:
+    """Lists, pixels and moments of a pass lie where those of the next view will."""
+    whole, g = crowd(9), torch.Generator().manual_seed(9)
+    active = some_rows(40, g)
+    session, rows = opened(whole, active), whole.rows(active)
+    native = session._view(0).rasterizer._native
+    before = native.memory_bytes()
+    fused(session, 0, rows, comparison())
+    layers = native.memory_bytes() - before
+    session.render(0, rows)  # not fused: its backward may come at any time
+    assert native.memory_bytes() - before > layers + 8 * rig().width * rig().height
+    tiles = -(-rig().width // 32) * -(-rig().height // 16)
+    assert layers < tiles * 16_000 + 48 * len(whole)
+
+
+def test_fits_of_two_threads_on_one_view_are_refused_or_right() -> None:
+    whole, g = crowd(9), torch.Generator().manual_seed(9)
+    active = some_rows(300, g)
+    session, rows, wanted = opened(whole, active), whole.rows(active), comparison()
+    want, found, messages = bits(fused(session, 0, rows, wanted)), [], []
+
+    def work() -> None:
+        for _ in range(40):
+            try:
+                found.append(bits(fused(session, 0, rows, wanted)))
+            except RuntimeError as error:
+                messages.append(str(error))
+
+    workers = [threading.Thread(target=work) for _ in range(3)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert len(found) + len(messages) == 120
+    assert all(one == want for one in found)
+    assert all("one Rasterizer per camera and thread" in message for message in messages)
 
 
 def test_no_backward_of_a_render_may_follow_a_fused_pass() -> None:

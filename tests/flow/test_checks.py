@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 import torch
-from flow_runs import TINY, WORLD, finish
+from flow_runs import TINY, WORLD
 
+from gsstream.cli.main import run_command
 from gsstream.core.errors import ComponentError, GsstreamError, InputError
 from gsstream.engine.assembly import checks as checks_module
 from gsstream.engine.assembly.assemble import Assembly, assemble
@@ -271,10 +272,12 @@ def test_where_the_level_comes_from(monkeypatch: pytest.MonkeyPatch) -> None:
         requested_checks("")
 
 
-def test_a_wrong_level_ends_the_command_before_anything_is_written(tmp_path: Path) -> None:
-    command = ["run", "--source", WORLD, "--out", str(tmp_path / "o")]
-    code, _, err = finish(*command, GSSTREAM_CHECKS="all")
-    assert (code, err) == (2, "error: GSSTREAM_CHECKS: expected one of off, frame, step, got 'all'\n")
+def test_a_wrong_level_ends_the_command_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GSSTREAM_CHECKS", "all")
+    assert run_command(["run", "--source", WORLD, "--out", str(tmp_path / "o")]) == 2
+    assert capsys.readouterr().err == "error: GSSTREAM_CHECKS: expected one of off, frame, step, got 'all'\n"
     assert not (tmp_path / "o").exists()
 
 

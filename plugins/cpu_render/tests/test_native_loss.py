@@ -95,7 +95,8 @@ def test_value_and_gradient_equal_float64(size: tuple[int, int], pair: Callable[
         value, gradient = oracle(image, target, weight)
         for goal in (target, PreparedImage(target)):
             result = photometric_loss(image, goal, dssim_weight=weight)
-            assert result.value == pytest.approx(value, abs=1e-6)
+            # A sum of two windows of 11 x 11 float32 products, in the order of the instruction set: 16 rounding errors.
+            assert result.value == pytest.approx(value, abs=2e-6)
             # Between flat images of unequal brightness two terms of size w |G - I| / C2 cancel: the worst case.
             assert_gradient(result.gradient, gradient, 1e-5 * (1 + weight))
 

@@ -71,7 +71,7 @@ def test_the_shell_stays_as_it_is_in_every_frame(method: str, settings: dict[str
 def test_motions_of_cells_and_of_fields_leave_the_shell_where_it_is(method: str) -> None:
     """A cell of the scene may reach into the shell."""
     settings = {key: value for key, value in TINY.items() if key != "stream.epochs"}
-    settings |= {"stream.change_threshold": 0, "motion.epochs": 2, "growth": "none"}
+    settings |= {"stream.change_threshold": 0, "motion.epochs": 4, "growth": "none"}
     with open_recording(WORLD) as source:
         encoder = encoder_for(method, source, settings)
         states = [encoder.encode(brighter(source.frame(index))).state.player for index in range(3)]

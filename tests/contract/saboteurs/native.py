@@ -88,6 +88,8 @@ class Shifted(Loss):
 class Scribbler(Loss):
     """Darkens the image once it has compared it."""
 
+    traits = LossTraits()  # of no other check
+
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:

@@ -89,6 +89,6 @@ def test_motions_look_everywhere_unless_told_to_look_near_the_change(
     """``large`` is the width from which pictures count as large; those of the case are small."""
     case = fit_fixture()
     asked = noted(case)
-    monkeypatch.setattr("gsstream.parts.motion.rigid.LARGE", large)
+    monkeypatch.setattr("gsstream.core.picture_size.LARGE", large)
     Rigid(Rigid.Config(everywhere=everywhere)).propose(case.scene, case.work, case.rng)
     assert set(asked) == {tiles}

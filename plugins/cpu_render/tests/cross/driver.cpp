@@ -100,7 +100,7 @@ void loss(Output& out, const std::vector<float>& image, const std::vector<float>
   const std::vector<uint8_t> all(static_cast<std::size_t>(job.tile_rows * job.tile_columns), 1);
   std::vector<float> gradient(image.size());
   const float scale = 1.0f / static_cast<float>(image.size());
-  job.image = image.data(), job.target = target.data(), job.active = job.wanted = all.data();
+  job.image = image.data(), job.target = {target.data(), nullptr}, job.active = job.wanted = all.data();
   job.gradient = gradient.data(), job.l1_scale = 0.8f * scale, job.ssim_scale = -0.2f * scale;
   const PhotometricSums sums = photometric_run(job);
   out.put("loss", {static_cast<float>(sums.l1 * scale), static_cast<float>(sums.dssim * scale)});

@@ -8,6 +8,7 @@
 #include <stdexcept>
 #include <string>
 #include <tuple>
+#include <utility>
 #include <vector>
 
 #include "fit/comparison_arrays.hpp"
@@ -45,7 +46,7 @@ class PyRasterizer {
                   FloatArray transmittance) {
     require(changed.ndim() == 1 && changed.shape(0) == rows.scene.count, "expected one row per changed id");
     const Target target = make_target(background, image, transmittance, rasterizer_.width(), rasterizer_.height());
-    current_ = {};
+    hold({});
     const nb::gil_scoped_release release;
     return rasterizer_.update(changed.data(), rows.scene, target);
   }
@@ -83,7 +84,7 @@ class PyRasterizer {
 
   void free_scratch() {
     rasterizer_.free_scratch();
-    current_ = {};
+    hold({});
   }
 
   void forward_cached(ConstFloatArray background, std::optional<ByteArray> tile_mask, FloatArray image,
@@ -106,7 +107,7 @@ class PyRasterizer {
 
   void forget() {
     rasterizer_.forget();
-    current_ = {};
+    hold({});
   }
 
   void backward_active(ConstFloatArray v_image, std::optional<ConstFloatArray> v_alpha, FloatArray v_means,
@@ -125,7 +126,7 @@ class PyRasterizer {
                                                    FloatArray v_opacities, FloatArray v_sh0, FloatArray v_shN) {
     require(rows.scene.count == rasterizer_.active_count(), "expected one row per active id");
     const ViewComparison view = comparison.view(rasterizer_.width(), rasterizer_.height());
-    current_ = rows;
+    hold(rows);
     means2d_.require(2 * rows.scene.count);
     GradientArrays out = gradient_arrays(rows.scene.count, rows.scene.sh_degree, v_means, v_quats, v_scales, v_opacities,
                                          v_sh0, v_shN);
@@ -164,7 +165,7 @@ class PyRasterizer {
       const nb::gil_scoped_release release;
       faults = pass(arrays.scene);
     }
-    current_ = arrays;
+    hold(arrays);
     return faults;
   }
 
@@ -187,6 +188,10 @@ class PyRasterizer {
   }
 
   Rasterizer rasterizer_;
+  // The arrays of the last pass. Letting go of old ones may let another thread run Python, which must not find this object
+  // half assigned: so they are swapped out whole, and go at the end of the call.
+  void hold(SceneArrays arrays) { std::swap(current_, arrays); }
+
   SceneArrays current_;
   Buffer<float> means2d_;  // gradients that the caller does not request
 };

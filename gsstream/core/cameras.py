@@ -63,6 +63,15 @@ class Cameras:
         ids = tuple(self.ids[i] for i in index)
         return replace(self, ids=ids, viewmats=self.viewmats[index], Ks=self.Ks[index])
 
+    def joined(self, other: Cameras) -> Cameras:
+        """Return one rig of these cameras, then of others of the same image size; the near plane is that of these."""
+        return replace(
+            self,
+            ids=(*self.ids, *other.ids),
+            viewmats=np.concatenate([self.viewmats, other.viewmats]),
+            Ks=np.concatenate([self.Ks, other.Ks]),
+        )
+
     def scaled(self, width: int, height: int) -> Cameras:
         """Return the same rig at another image size.
 

@@ -101,6 +101,12 @@ class Frame:
         )
 
 
+def join_frames(train: Frame, test: Frame) -> Frame:
+    """Return one instant of training cameras, then of test cameras; the rest is that of the training cameras' frame."""
+    images = np.concatenate([train.images, test.images])
+    return replace(train, images=images, cameras=train.cameras.joined(test.cameras))
+
+
 def shrink_frame(frame: Frame, factor: int) -> Frame:
     """Return the frame with pictures ``factor`` times smaller, means over squares; what fills no square is cut off."""
     if factor == 1:

@@ -13,10 +13,10 @@ import pytest
 from flow_runs import arguments, demo_copy
 
 from gsstream.cli.main import run_command
-from gsstream.core.frame import Frame
+from gsstream.core.frame import Frame, join_frames
 from gsstream.encode import open_recording
 from gsstream.engine.run.measure import HeldOut
-from gsstream.input.prepare.pose_checks import check_poses, check_swapped, first_look, joined
+from gsstream.input.prepare.pose_checks import check_poses, check_swapped, first_look
 from gsstream.input.recordings.base import FrameSource
 from gsstream.plugins.catalog import load_catalog
 
@@ -50,7 +50,7 @@ def test_a_black_camera_is_named_before_a_run(frame: Frame) -> None:
 def test_swapped_cameras_are_named_and_one_wrong_pose_is_no_swap(frame: Frame, pair: tuple[int, int]) -> None:
     """The last camera is the test camera."""
     with open_recording("demo") as source:
-        whole = joined(frame, source.frame(0, "test"))
+        whole = join_frames(frame, source.frame(0, "test"))
         a, b = pair
         images = whole.images.copy()
         images[[a, b]] = images[[b, a]]

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-
-import numpy as np
 
 from gsstream.core.errors import InputError
-from gsstream.core.frame import Frame, PointCloud, shrink_frame
+from gsstream.core.frame import Frame, PointCloud, join_frames, shrink_frame
 from gsstream.core.signs import Tell, silent
 from gsstream.engine.fit import schedule
 from gsstream.input.recordings.base import FrameSource, PointKind, SourceInfo
@@ -43,14 +40,7 @@ def with_test_views(source: FrameSource, frame: Frame) -> Frame:
 
     This is what ``data.leak = points`` lets seeding see.
     """
-    test = source.frame(frame.index, "test")
-    cameras = replace(
-        frame.cameras,
-        ids=(*frame.cameras.ids, *test.cameras.ids),
-        viewmats=np.concatenate([frame.cameras.viewmats, test.cameras.viewmats]),
-        Ks=np.concatenate([frame.cameras.Ks, test.cameras.Ks]),
-    )
-    return replace(frame, images=np.concatenate([frame.images, test.images]), cameras=cameras)
+    return join_frames(frame, source.frame(frame.index, "test"))
 
 
 def _base_points(

@@ -13,7 +13,7 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import EndOfRecording
-from gsstream.core.frame import Frame, shrink_frame
+from gsstream.core.frame import Frame, join_frames, shrink_frame
 from gsstream.core.shapes import FloatArray
 from gsstream.input.prepare.findings import Finding, error
 from gsstream.input.prepare.match_checks import REPAIRS
@@ -56,20 +56,9 @@ def first_look(source: FrameSource) -> list[Finding]:
         if blank := check_blank(Thumbnails(frame.images[None], train, len(train))):
             return blank[:1]
         frame = _small(frame)
-        return check_poses(frame) or check_swapped(joined(frame, _small(source.frame(0, "test")))) or found[:1]
+        return check_poses(frame) or check_swapped(join_frames(frame, _small(source.frame(0, "test")))) or found[:1]
     except EndOfRecording:
         return found[:1]
-
-
-def joined(train: Frame, test: Frame) -> Frame:
-    """Return one instant of training cameras, then of test cameras."""
-    cameras = replace(
-        train.cameras,
-        ids=(*train.cameras.ids, *test.cameras.ids),
-        viewmats=np.concatenate([train.cameras.viewmats, test.cameras.viewmats]),
-        Ks=np.concatenate([train.cameras.Ks, test.cameras.Ks]),
-    )
-    return replace(train, images=np.concatenate([train.images, test.images]), cameras=cameras)
 
 
 def check_poses(frame: Frame) -> list[Finding]:

@@ -10,16 +10,14 @@ import importlib.util
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
-import numpy as np
-
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError, SourceError
-from gsstream.core.frame import Frame, shrink_frame
+from gsstream.core.frame import Frame, join_frames, shrink_frame
 from gsstream.core.needs import install_extra
 from gsstream.input.prepare.findings import Finding, error, note
 from gsstream.input.prepare.match_checks import check_matches
 from gsstream.input.prepare.picture_checks import Thumbnails, check_blank, check_change, check_same, read_thumbnails
-from gsstream.input.prepare.pose_checks import check_poses, check_swapped, joined
+from gsstream.input.prepare.pose_checks import check_poses, check_swapped
 from gsstream.input.prepare.rig_checks import check_axes, check_intrinsics, check_overlap, check_placement
 from gsstream.input.prepare.sync_checks import check_sync
 from gsstream.input.recordings.base import FilesMissing, FrameSource
@@ -60,12 +58,7 @@ def _merged(found: list[Finding]) -> list[Finding]:
 def rig_of(source: FrameSource) -> Cameras:
     """Return training cameras, then test cameras."""
     train, test = source.info.train, source.info.test
-    return replace(
-        train,
-        ids=(*train.ids, *test.ids),
-        viewmats=np.concatenate([train.viewmats, test.viewmats]),
-        Ks=np.concatenate([train.Ks, test.Ks]),
-    )
+    return train.joined(test)
 
 
 def _stages(source: FrameSource, open_scene: Open, frames: int, features: bool) -> Iterator[list[Finding]]:
@@ -83,7 +76,7 @@ def _stages(source: FrameSource, open_scene: Open, frames: int, features: bool) 
     try:
         thumbs = _thumbnails(source, open_scene, rig, frames)
         train_frame = source.frame(0, "train")
-        first = joined(train_frame, source.frame(0, "test"))
+        first = join_frames(train_frame, source.frame(0, "test"))
     except SourceError as fault:
         yield [error("images", str(fault))]
         return

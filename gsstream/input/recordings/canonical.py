@@ -22,12 +22,7 @@ def recording_similarity(source: FrameSource) -> World:
     So it does not depend on the split.
     """
     train, test = source.info.train, source.info.test
-    rig = replace(
-        train,
-        ids=(*train.ids, *test.ids),
-        viewmats=np.concatenate([train.viewmats, test.viewmats]),
-        Ks=np.concatenate([train.Ks, test.Ks]),
-    )
+    rig = train.joined(test)
     return rig_similarity(rig, source.points)
 
 

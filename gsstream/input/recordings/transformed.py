@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsstream.core.cameras import Cameras
 from gsstream.core.errors import EndOfRecording, SourceError
 from gsstream.core.frame import Arrival, Frame, PointCloud
 from gsstream.core.rng import Rng
@@ -61,7 +60,7 @@ class TransformedSource:
     ) -> None:
         self._source, self._options, self._disturbances, self._rng = source, options, disturbances, Rng(seed)
         info = source.info
-        both = _joined(info.train, info.test)
+        both = info.train.joined(info.test)
         self._home: dict[str, Split] = dict.fromkeys(info.test.ids, "test")
         self._home.update(dict.fromkeys(info.train.ids, "train"))
         train, test, self._away = choose_split(options, info.train, info.test)
@@ -204,12 +203,3 @@ class TransformedSource:
         frame = cache[key]
         image: FloatArray = frame.images[frame.cameras.ids.index(name)]
         return image
-
-
-def _joined(train: Cameras, test: Cameras) -> Cameras:
-    return replace(
-        train,
-        ids=(*train.ids, *test.ids),
-        viewmats=np.concatenate([train.viewmats, test.viewmats]),
-        Ks=np.concatenate([train.Ks, test.Ks]),
-    )

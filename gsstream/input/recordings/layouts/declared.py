@@ -5,7 +5,6 @@ Pinhole images of one size need none of it; :class:`~gsstream.input.recordings.m
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +23,7 @@ def read(folder: Path, *, any_sizes: bool = False) -> Recording:
     known = read_calibration(folder, any_sizes=any_sizes)
     check_files(folder, known)
     train, test = known.train, known.test
-    rig = replace(
-        train,
-        ids=(*train.ids, *test.ids),
-        viewmats=np.concatenate([train.viewmats, test.viewmats]),
-        Ks=np.concatenate([train.Ks, test.Ks]),
-    )
+    rig = train.joined(test)
     return Recording(
         name=known.name,
         where=str(folder / CALIBRATION_FILE),

@@ -158,12 +158,27 @@ def test_before_the_first_packet_it_stops_at_once(tmp_path: Path, number: str, c
         assert reader.damage is None
 
 
+#: Says in a file when frame 1 is in the works: an interrupt that comes before it ends the run at once.
+FRAME_1_BEGINS = """
+from pathlib import Path
+from gsstream.engine.run.encoder import Encoder
+encode = Encoder.encode
+def noted(self, frame):
+    if frame.index == 1:
+        Path({!r}).touch()
+    return encode(self, frame)
+Encoder.encode = noted
+"""
+
+
 def test_interrupted_twice_it_does_not_wait_for_the_frame(tmp_path: Path) -> None:
-    process = Forked(arguments(out := tmp_path / "o", stream__epochs=10_000))
-    wait_for((out / "metrics.jsonl").exists, process)
+    out, begun = tmp_path / "o", tmp_path / "begun"
+    process = Forked(arguments(out, stream__epochs=10_000), first=FRAME_1_BEGINS.format(str(begun)))
+    wait_for(begun.exists, process)
     for _ in range(2):
+        assert process.poll() is None
         os.kill(process.pid, signal.SIGINT)
-        time.sleep(0.2)
+        time.sleep(1)  # longer than a pass: two interrupts at once would count as one
     _, err = process.communicate(timeout=600)
     assert (process.returncode, err) == (130, "interrupted\n")
     with StreamReader(out / "stream.gss") as reader:

@@ -44,16 +44,6 @@ def test_touched_only_changes_exactly_the_pixels_that_change(seed: int) -> None:
     assert equal_bits(gradients, rows_of_gradients(full.backward(*upstream(seed)), ids))
 
 
-def test_depth_ties_between_active_and_frozen_keep_memory_order() -> None:
-    splats = random_splats(120, 5, 1)
-    splats.means[:] = splats.means[0]
-    ids = some_ids(120, 40, 5)
-    subject = rasterizer()
-    subject.forward(splats)
-    subject.freeze(None, ids)
-    assert equal_bits(subject.forward_active(rows_of(splats, ids)), rasterizer().forward(splats))
-
-
 def test_forward_cached_renders_only_wanted_tiles() -> None:
     subject = rasterizer()
     want, _ = subject.forward(random_splats(100, 7, 1))

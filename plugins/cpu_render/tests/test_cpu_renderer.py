@@ -55,16 +55,6 @@ def replaced(
     return Gaussians(**{name: base[name].index_copy(0, ids, value.detach()) for name, value in rows.items()})
 
 
-def test_screen_gradient_agrees_with_the_reference_renderer() -> None:
-    v_image, _ = upstream()
-    got = CpuRenderer().screen_gradient(scene(), rig(), 0, v_image)
-    want = ReferenceRenderer().screen_gradient(scene().map(torch.Tensor.double), rig(), 0, v_image.double())
-    assert float((got.gradient - want.gradient).abs().max()) <= 2e-5 * float(want.gradient.abs().max())
-    # The reference tests the bounding box, we test the ellipse: ours are a subset that holds all with a gradient.
-    assert not (got.visible & ~want.visible).any()
-    assert not ((want.gradient != 0).any(1) & ~got.visible).any()
-
-
 def test_near_plane_of_the_rig_is_used() -> None:
     cameras = rig()
     cut = Cameras(cameras.ids, cameras.viewmats, cameras.Ks, WIDTH, HEIGHT, near_plane=3.0)
@@ -115,44 +105,6 @@ def test_tensors_that_are_not_contiguous() -> None:
     assert torch.equal(got, CpuRenderer().render(gaussians, rig(), 0, BACKGROUND).image)
 
 
-@pytest.mark.parametrize("ids", [[5], [3, 17, 80, 119], [80, 3, 119, 17], []])
-def test_session_has_the_bits_of_a_full_render(ids: list[int]) -> None:
-    index = torch.tensor(ids, dtype=torch.int64)
-    session = CpuRenderer().open(scene(), index, rig(), BACKGROUND)
-    for step in range(4):
-        view = step % 2
-        rows = leaves(scene().rows(index).map(lambda t, s=step: t + 0.1 * s))
-        probe = torch.zeros(len(ids), 2, requires_grad=True)
-        output = session.render(view, rows, probe=probe)
-        whole = leaves(replaced(scene(), index, rows))
-        whole_probe = torch.zeros(N, 2, requires_grad=True)
-        want = CpuRenderer().open(whole, None, rig(), BACKGROUND).render(view, whole, probe=whole_probe)
-        assert torch.equal(output.image, want.image)
-        assert torch.equal(output.alpha, want.alpha)
-        backpropagate(output, step)
-        backpropagate(want, step)
-        for g, w in zip([*grads(rows), probe.grad], [*grads(whole), whole_probe.grad], strict=True):
-            assert g is not None
-            assert w is not None
-            assert torch.equal(g, w[index])
-
-
-def test_session_with_a_tile_mask_keeps_the_cached_render_elsewhere() -> None:
-    ids = torch.arange(0, N, 2)
-    session = CpuRenderer().open(scene(), ids, rig(), BACKGROUND)
-    mask = torch.zeros(3, 4, dtype=torch.bool)
-    mask[1, 1:3] = True
-    rows = scene().rows(ids).map(lambda t: t + 0.2)
-    image = session.render(0, rows, tile_mask=mask).image
-    old = CpuRenderer().render(scene(), rig(), 0, BACKGROUND).image
-    new = CpuRenderer().render(replaced(scene(), ids, rows), rig(), 0, BACKGROUND).image
-    inside = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-    inside[16:32, 16:48] = True
-    assert torch.equal(image[inside], new[inside])
-    assert torch.equal(image[~inside], old[~inside])
-    assert torch.equal(session.render(0, rows).image, new)
-
-
 @pytest.mark.parametrize("ids", [[], [7], [3, 17, 80]])
 def test_session_tells_the_tiles_its_rows_are_in(ids: list[int]) -> None:
     index = torch.tensor(ids, dtype=torch.int64)
@@ -170,13 +122,6 @@ def test_session_tells_the_tiles_its_rows_are_in(ids: list[int]) -> None:
         (output.image * outside).sum().backward()
         assert not any(bool(g.any()) for g in grads(rows) if g is not None)
         assert bool(inside.any()) == bool(ids)
-
-
-def test_full_session_with_a_mask_shows_the_background_elsewhere() -> None:
-    mask = torch.zeros(3, 4, dtype=torch.bool)
-    mask[0, 0] = True
-    image = CpuRenderer().open(scene(), None, rig(), BACKGROUND).render(0, scene(), tile_mask=mask).image
-    assert torch.equal(image[16:], torch.tensor(BACKGROUND).expand(HEIGHT - 16, WIDTH, 3))
 
 
 def test_rasterisers_return_to_the_pool() -> None:

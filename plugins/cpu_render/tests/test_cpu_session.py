@@ -11,8 +11,7 @@ from gsstream_cpu_render.pool import acquire_rasterizer, release_idle_memory
 from gsstream_cpu_render.renderer import CpuRenderer
 from test_cpu_renderer import N, backpropagate, leaves, replaced, rig, scene, upstream
 
-from gsstream.api import Gaussians, InputError, RenderSession, ScatterSession
-from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.api import Gaussians, InputError, RenderSession
 
 Scene = Gaussians[torch.Tensor]
 
@@ -127,14 +126,3 @@ def test_cache_bytes_follow_views_and_gaussians() -> None:
     assert report.total > 64 * N + pixels
     assert report.per_camera_and_gaussian == report.total / N
     assert session.commit(scene(), torch.zeros(0, dtype=torch.int64)).cache_bytes().total == report.total
-
-
-def test_the_session_every_renderer_has_commits_too() -> None:
-    whole, ids = scene().rows(torch.arange(8)), torch.tensor([1, 5])
-    session = ReferenceRenderer().open(whole, ids, rig(), BACKGROUND)
-    assert isinstance(session, ScatterSession)
-    after = Gaussians(**{**dict(whole.items()), "means": whole.means.index_add(0, ids, torch.full((2, 3), 0.1))})
-    session = session.commit(after, ids)
-    assert session.cache_bytes().total == 0
-    image = session.render(0, after).image
-    assert torch.equal(image, ReferenceRenderer().render(after, rig(), 0, BACKGROUND).image)

@@ -146,25 +146,40 @@ class Sessions(RuleBasedStateMachine):
         """Also as the whole scene with these rows is rendered and differentiated."""
         mask = tiles_of(seed) if masked else None
         mine, theirs, rows = (leaves(self.rows(amount, seed)) for _ in range(3))
+        probe, full_probe = (torch.zeros(len(each), 2, requires_grad=True) for each in (rows, self.whole))
         output, fresh = (
             self.session.render(view, mine, tile_mask=mask),
-            self.anew().render(view, theirs, tile_mask=mask),
+            self.anew().render(view, theirs, tile_mask=mask, probe=probe),
         )
         same(rendered(output), rendered(fresh))
         backpropagate(fresh, seed)
         everything = leaves(rows if self.active is None else replaced(self.whole, self.active, rows))
-        full = CpuRenderer().open(everything, None, rig(), BACKGROUND).render(view, everything, tile_mask=mask)
+        open_wide = CpuRenderer().open(everything, None, rig(), BACKGROUND)
+        full = open_wide.render(view, everything, tile_mask=mask, probe=full_probe)
         backpropagate(full, seed)
         inside = torch.from_numpy(masked_pixels(random_mask(seed))) if masked else torch.ones(HEIGHT, WIDTH) > 0
         assert torch.equal(output.image[inside], full.image[inside])
         assert torch.equal(output.alpha[inside], full.alpha[inside])
         ids = torch.arange(len(self.whole)) if self.active is None else self.active
-        same(grads(theirs), [value[ids] for value in grads(everything)])
+        same([*grads(theirs), probe.grad], [value[ids] for value in (*grads(everything), full_probe.grad)])
+        self.compare_outside(view, output, inside)
         if later:
             self.waiting = output, mine, theirs, seed
         else:
             backpropagate(output, seed)
             same(grads(mine), grads(theirs))
+
+    def compare_outside(self, view: int, output: RenderOutput, inside: torch.Tensor) -> None:
+        """Other tiles show the scene that the session was opened with, or the background of a session of all rows."""
+        image = output.image.detach()
+        if self.active is None:
+            assert torch.equal(image[~inside], torch.tensor(BACKGROUND).expand(HEIGHT, WIDTH, 3)[~inside])
+            return
+        old = CpuRenderer().render(self.whole, rig(), view, BACKGROUND).image
+        assert output.tiles is not None
+        reached = torch.from_numpy(masked_pixels(output.tiles.numpy()))
+        assert torch.equal(image[~(inside & reached)], old[~(inside & reached)])
+        assert len(self.active) or not reached.any()
 
     @precondition(lambda self: self.waiting is not None)
     @rule()

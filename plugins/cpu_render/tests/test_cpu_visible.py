@@ -122,6 +122,8 @@ def test_other_tiles_are_refused(wrong: torch.Tensor) -> None:
     for each in (opened(scene()), differentiated(scene())):
         with pytest.raises(ShapeError, match=r"tiles: expected bool \[3, 5\] .* got"):
             each.visible(0, wrong)
+    with pytest.raises(ShapeError, match="tile"):
+        opened(scene()).visible_anywhere(torch.ones(2, 1, 1, dtype=torch.bool))
 
 
 def test_the_rasteriser_refuses_tiles_that_it_did_not_draw() -> None:
@@ -135,8 +137,3 @@ def test_the_rasteriser_refuses_tiles_that_it_did_not_draw() -> None:
     assert rasterizer.contributing_in_cache(part).any()
     with pytest.raises(InputError, match="did not cover"):
         rasterizer.contributing_in_cache(everything)
-
-
-def test_tiles_of_another_shape_are_refused_for_all_cameras() -> None:
-    with pytest.raises(ShapeError, match="tile"):
-        opened(scene()).visible_anywhere(torch.ones(2, 1, 1, dtype=torch.bool))

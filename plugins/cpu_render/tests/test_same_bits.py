@@ -12,18 +12,19 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cpu_scenes import random_splats, rasterizer, upstream
+from cpu_scenes import BACKGROUND, random_splats, rasterizer, upstream
 from gsstream_cpu_render.adam import adam_rows
 from gsstream_cpu_render.adam_part import CpuAdam
 from gsstream_cpu_render.loss import PreparedImage, photometric_loss, tile_shape
+from gsstream_cpu_render.renderer import CpuRenderer
 from gsstream_cpu_render.threads import set_num_threads
-from test_cpu_fit import comparison
+from test_cpu_fit import VIEW, comparison, values
 from test_cpu_pass import CASES, captured, solved
-from test_cpu_renderer import scene
-from test_cpu_whole import fused, values
+from test_cpu_renderer import rig, scene
 from test_native_adam import fresh
 from test_native_loss import near_pair
 
+from gsstream.api import Gaussians, WrtScene
 from gsstream.testing.optimiser.checks import _residual_case
 
 
@@ -40,9 +41,13 @@ def rasterised() -> list[Any]:
 
 def whole_scene() -> list[Any]:
     """Twice, with a smaller scene in between."""
-    first = fused(scene(), comparison(coloured=True))
-    fused(scene(seed=1, coefficients=1), comparison())
-    return [*values(first).values(), *values(fused(scene(), comparison(coloured=True))).values()]
+    def fused(rows: Gaussians[torch.Tensor], coloured: bool) -> list[torch.Tensor]:
+        session = CpuRenderer().open(rows, None, rig(), BACKGROUND)
+        return list(values(session.loss_and_grad(VIEW, comparison(coloured), WrtScene(rows))).values())
+
+    first = fused(scene(), True)
+    fused(scene(seed=1, coefficients=1), False)
+    return [*first, *fused(scene(), True)]
 
 
 def residual_table() -> list[Any]:

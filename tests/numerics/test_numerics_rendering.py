@@ -12,7 +12,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from numeric_scenes import Scene, blobs, camera, rendered, upstream, worst
+from numeric_scenes import Scene, blobs, camera, random_scene, rendered, upstream, worst
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError
@@ -36,7 +36,6 @@ needs_native = pytest.mark.skipif("cpu" not in RENDERERS, reason="gsstream-cpu-r
 HERE = [[0.1, 0.1, 0.0]]
 PILE = [[0.01, 0.01, 0]] * 2000
 STACK = torch.randn(2000, 3, generator=torch.Generator().manual_seed(0))
-SMALL = math.log(0.02)
 #: Scene and camera, and how far gradients may be from float64 by the largest of all attributes.
 CASES: dict[str, tuple[Scene, Cameras, float]] = {
     "just beyond the near plane": (blobs([[1e-4, 1e-4, -2.98999]], -9.0), camera(), 1e-4),
@@ -164,3 +163,24 @@ def test_cameras_whose_matrices_no_renderer_reads_whole_are_refused() -> None:
     for near in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ShapeError, match="near plane"):
             camera(near=near).validate()
+
+
+@needs_native
+def test_instruction_sets_agree_among_themselves() -> None:
+    """Up to rounding: another set sums in another order. Also: an idle rasteriser made for one set is not used for
+    another (it was, and every comparison of sets through the renderer compared a set with itself)."""
+    native = pytest.importorskip("gsstream_cpu_render._native")
+    cameras, grad = camera(), upstream(camera())
+    before = native.active_isa()
+    found = {}
+    for name in native.supported_isas():
+        native.select_isa(name)
+        found[name] = rendered(RENDERERS["cpu"], random_scene(5), cameras, grad)
+        again, _ = rendered(RENDERERS["cpu"], random_scene(5), cameras, grad)
+        assert torch.equal(again, found[name][0]), "an idle object of another set was used"
+    native.select_isa(before)
+    first_image, first_gradients = next(iter(found.values()))
+    for image, gradients in found.values():
+        assert worst(image, first_image) < 2e-6
+        for (_, a), (_, b) in zip(gradients.items(), first_gradients.items(), strict=True):
+            assert worst(a, b) < 2e-5

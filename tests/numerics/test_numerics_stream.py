@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numeric_scenes import random_scene, some
 from residual_oracle import decode_rows
 
-from gsstream.core.changes import Delta, Layout, Residual, Scene, apply_delta
+from gsstream.core.changes import Delta, Layout, Residual, Scene
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.packet import decode_delta, encode_delta, quantise_key
@@ -29,33 +29,6 @@ from gsstream.parts.update.base import MAX_SYMBOL, quantise_latents
 def layout(nodes: int = 6, rows: int = 2) -> Layout:
     levels = np.zeros(nodes * rows, np.uint8)
     return Layout(np.full(nodes, rows, np.int32), levels, np.array([0.5], np.float32))
-
-
-def moves(gates: object, levels: int = 10, size: int = 3) -> Delta:
-    opened = np.asarray(gates, np.uint8)
-    rows = 2 * int((opened > 0).sum())
-    table = np.arange(3 * rows, dtype=np.int32).reshape(rows, 3) % (2 * size + 1) - size
-    return Delta((Residual(opened, levels, {"means": table}, {"means": 0.25}),))
-
-
-@pytest.mark.parametrize("levels", [1, 10, 255])
-@pytest.mark.parametrize("share", ["none", "one", "all"])
-def test_no_row_one_row_and_every_row(share: str, levels: int) -> None:
-    gates = np.zeros(6, np.uint8)
-    gates[{"none": slice(0), "one": slice(3, 4), "all": slice(None)}[share]] = levels
-    delta = moves(gates, levels)
-    data = encode_delta(delta, layout(), {}, frame=1).data
-    scene = random_scene(0, n=12).map(lambda value: value.numpy())
-    back = decode_delta(data, Scene(scene, layout()), {})
-    assert np.array_equal(back.residual.gates, gates)
-    assert np.array_equal(back.residual.symbols["means"], delta.residual.symbols["means"])
-    moved = apply_delta(Scene(scene, layout()), back).gaussians
-    closed = np.repeat(gates == 0, 2)
-    for (name, before), (_, after) in zip(scene.items(), moved.items(), strict=True):
-        assert np.array_equal(before[closed], after[closed]), f"{name}: rows behind closed gates keep their bits"
-        assert np.isfinite(after).all()
-    if share == "none":
-        assert moved is scene
 
 
 @pytest.mark.parametrize("rule", [Additive(), LatentResidual()], ids=["additive", "latent"])
@@ -112,8 +85,9 @@ def test_a_key_packet_refuses_what_it_cannot_hold(name: str, bad: float) -> None
     getattr(scene, name).reshape(5, -1)[3, 0] = bad
     if name == "quats" and bad == 3e38:
         assert np.isfinite(quantise_key(scene).quats).all(), "a quaternion of any norm is a rotation"
-        return
-    with pytest.raises(ShapeError, match=name):
+        scene.quats[3], bad = 0.0, 0.0
+    said = {0.0: "norm zero", 3e38: "diverged|below"}.get(bad, "finite")
+    with pytest.raises(ShapeError, match=rf"{name}.*({said})"):
         quantise_key(scene)
 
 

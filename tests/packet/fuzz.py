@@ -48,6 +48,8 @@ def play(path: Path, data: bytes, base: Base) -> str:
             first = playback.frames[0]
             for frame, scene in playback:
                 _check(scene, base.scenes[seen] if seen < sound else None, frame)
+                if len(scene) != int(playback.player_state(frame).layout.node_counts.sum()):
+                    raise Failure(f"frame {frame}: the nodes hold another number of Gaussians than there are")
                 if frame != first + seen:
                     raise Failure(f"frame {frame} came where {first + seen} was due")
                 seen += 1

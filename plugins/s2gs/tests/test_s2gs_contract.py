@@ -19,6 +19,8 @@ RELEASED = Gradient(loss="l2norm", aggregate="sum-of-norms", normalisation="rati
 PARTS = [
     StreamingOctree(Octree(gate_level=2)), StreamingOctree(Octree(grouping="gaussian")),
     ViewSpaceGradient(RELEASED), ViewSpaceGradient(Gradient(normalisation="minmax")),
+    ViewSpaceGradient(Gradient(aggregate="mean-vector", normalisation="ratio")),
+    ViewSpaceGradient(Gradient(aggregate="mean-of-norms", normalisation="ratio")),
     ViewSpaceGradient(Gradient(normalisation="noise")), ViewSpaceGradient(Gradient(epsilon_mode="relative")),
     GumbelSigmoid(Gate(levels=1)), GumbelSigmoid(Gate(noise="none")),
     GumbelSigmoid(Gate(levels=1, clamp_gradient=True)), GumbelSigmoid(Gate(levels=1, noise="gumbel")),

@@ -3,79 +3,36 @@
 
 from __future__ import annotations
 
-import importlib
 import math
-from importlib.metadata import entry_points
-from importlib.resources import files
 
 import numpy as np
 import pytest
 import torch
-from gsstream_s2gs import plugin
 from gsstream_s2gs.latent import LatentCode, LatentResidual
 from pydantic import ValidationError
 from residual_oracle import train_rows
-from ruamel.yaml import YAML
 from s2gs_scene import gaussians
 
-from gsstream.api import ConfidenceEstimator, GateSampler, Part, Propagation, Regularizer, Structure, UpdateRule
 from gsstream.core.changes import Delta, Layout, Residual, Scene, apply_delta
 from gsstream.core.gaussians import Gaussians
 from gsstream.parts.update.base import init_latents
-from gsstream.recipe.model import Recipe
+from gsstream.plugins.catalog import load_catalog
+from gsstream.recipe.load import resolve_recipe
 
-KINDS = {
-    "structure": Structure, "confidence": ConfidenceEstimator, "propagation": Propagation,
-    "gate": GateSampler, "regularizer": Regularizer, "update": UpdateRule,
-}  # fmt: skip
+KINDS = ("structure", "confidence", "propagation", "gate", "regularizer", "update")
 
 
-def part_class(spec: object) -> type[Part]:
-    module, name = spec.target.split(":")  # type: ignore[attr-defined]
-    return getattr(importlib.import_module(module), name)  # type: ignore[no-any-return]
-
-
-def test_the_entry_point_leads_here() -> None:
-    (found,) = (e for e in entry_points(group="gsstream") if e.name == "s2gs")
-    assert found.load() is plugin
-    assert list(dict.fromkeys(s.kind for s in plugin.gsstream_components())) == list(KINDS)
-    assert [s.name for s in plugin.gsstream_methods()] == ["s2gs", "s2gs-fast", "s2gs-edge", "s2gs-paper"]
-
-
-class TestRecipes:
-    def read(self, name: str) -> dict:
-        (spec,) = (m for m in plugin.METHODS if m.name == name)
-        package, path = spec.recipe.split(":")
-        return YAML(typ="safe").load(files(package).joinpath(path).read_text("utf-8"))
-
-    def resolved(self, name: str) -> Recipe:
-        """Differences over their base, key by key."""
-
-        def merge(below: dict, above: dict) -> dict:
-            both = dict(below)
-            for key, value in above.items():
-                both[key] = merge(both[key], value) if isinstance(both.get(key), dict) else value
-            return both
-
-        data = self.read(name)
-        base = data.pop("base", None)
-        return Recipe.model_validate(merge(self.read(base), data) if base else data)
-
-    @pytest.mark.parametrize(("name", "epochs"), [("s2gs", 20), ("s2gs-fast", 10), ("s2gs-edge", 6)])
-    def test_budgets_of_the_paper(self, name: str, epochs: int) -> None:
-        recipe = self.resolved(name)
-        assert recipe.method == name
-        assert recipe.stream.epochs == epochs
-        assert recipe.first_frame.epochs == 250
-
-    @pytest.mark.parametrize("name", ["s2gs", "s2gs-fast", "s2gs-edge", "s2gs-paper"])
-    def test_every_slot_is_one_of_our_parts_with_valid_settings(self, name: str) -> None:
-        recipe = self.resolved(name)
-        specs = {(s.kind, s.name): s for s in plugin.COMPONENTS}
-        assert recipe.growth.name == "none", "the paper's scene keeps its anchors"
-        for kind in KINDS:
-            reference = getattr(recipe, kind)
-            part_class(specs[kind, reference.name]).Config.model_validate(reference.params)
+@pytest.mark.parametrize(("name", "epochs"), [("s2gs", 20), ("s2gs-fast", 10), ("s2gs-edge", 6), ("s2gs-paper", 20)])
+def test_budgets_of_the_paper(name: str, epochs: int) -> None:
+    """And every slot of the paper's has one of these parts; its settings: tests/engine/test_assemble.py."""
+    catalog = load_catalog()
+    recipe = resolve_recipe(name, catalog.recipe_path).recipe
+    assert recipe.method == name
+    assert recipe.stream.epochs == epochs
+    assert recipe.first_frame.epochs == 250
+    assert recipe.growth.name == "none", "the paper's scene keeps its anchors"
+    parts = [catalog.entries[kind, getattr(recipe, kind).name] for kind in KINDS]
+    assert {part.distribution for part in parts} == {"gsstream-s2gs"}
 
 
 class TestLatent:

@@ -38,6 +38,10 @@ def _residual_lies(packet: EncodedPacket) -> Iterator[tuple[str, str, bytes, str
         head.bits(0, 1)
         data = means[:6] + pack_blobs([head.to_bytes(), b""])
         yield f"{bins} bins from {low}", "means", data, f"histogram of {bins} bins from {low}: expected at most 16384"
+    for bits in (-1, 16, 2**31 - 1):  # of four attributes that are sent
+        pattern = np.full((10, 1), 15, np.int32)
+        pattern[3] = bits
+        yield f"pattern {bits}", "pattern", encode_symbols(pattern), "pattern of a row: expected 0 to 15"
     no_decoder, channels = "is unknown, or its decoder was never sent", "channels without a decoder, got"
     heads = [
         (2, 3, 0.1, f"mode 2 {no_decoder}"), (1, 3, 0.1, f"mode 1 {no_decoder}"), (0, 0, 0.1, f"{channels} 0"),

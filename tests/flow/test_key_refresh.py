@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +9,8 @@ import numpy as np
 import pytest
 from flow_runs import WORLD, Witness, encode, metrics
 
-from gsstream.cli.main import run_command
 from gsstream.engine.method import parts as method
-from gsstream.packet import PacketKind, StreamReader, quantise_key
-from gsstream.packet.base import FILE_HEADER
+from gsstream.packet import StreamReader, quantise_key
 from gsstream.player.manifest import manifest
 from gsstream.player.playback import Playback
 
@@ -73,40 +70,8 @@ def test_a_key_packet_holds_the_scene_of_its_frame(tmp_path, monkeypatch, method
                for line, entry in zip(lines, manifest(stream)["packets"], strict=True))  # fmt: skip
 
 
-def test_who_joins_at_any_key_packet_sees_the_same_frames(tmp_path):
-    encode(tmp_path, method="s2gs-edge", **PERIOD)
-    stream = tmp_path / "stream.gss"
-    data, toc = stream.read_bytes(), manifest(stream)
-    assert [segment["frames"] for segment in toc["segments"]] == [[0, 1], [2, 3], [4, 5]]
-    with Playback(stream) as whole:
-        for segment in toc["segments"]:
-            late = tmp_path / "late.gss"
-            late.write_bytes(data[: FILE_HEADER.size] + data[segment["range"][0] :][: -12 - 21])  # any cut of the index
-            first = segment["frames"][0]
-            with Playback(late) as joined:
-                assert joined.frames[0] == first
-                for frame in (5, first, first + 1):
-                    assert same(joined.state_at(frame), whole.state_at(frame))
-    with Playback(stream) as seeking:
-        for frame in (5, 2, 3, 0, 4):
-            with Playback(stream) as other:
-                assert same(seeking.state_at(frame), other.state_at(frame))
-
-
 def test_a_key_packet_after_still_frames_says_which_picture_it_shows(tmp_path):
     encode(tmp_path, source=f"{WORLD}&static=1", method="s2gs-edge", **PERIOD)
     assert kinds(tmp_path / "stream.gss") == "KEKEKE"
     with Playback(tmp_path / "stream.gss") as playback:
         assert playback.player_state(4).meta.extra["shown"] == 0
-
-
-def test_info_and_play_know_later_key_packets(tmp_path, capsys):
-    encode(tmp_path / "o", method="s2gs-edge", **PERIOD)
-    capsys.readouterr()
-    stream = str(tmp_path / "o" / "stream.gss")
-    assert run_command(["info", stream, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert [packet["kind"] for packet in found["packets"]] == ["key", "delta"] * 3
-    deltas = [packet["size"] for packet in found["packets"] if packet["kind"] == "delta"]
-    assert found["summary"]["kb_per_frame"] == pytest.approx(sum(deltas) / 3000)
-    assert PacketKind.KEY == 1

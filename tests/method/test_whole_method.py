@@ -36,7 +36,7 @@ from gsstream.testing.streaming_method.example import ExampleMethod
 Follow: Any = ExampleMethod  # final: only what is wrong on purpose may inherit from it
 
 RUN = [
-    "run", "--source", SOURCE, "--method", "hold", "--quiet", "--no-pictures", "--set", "first_frame.max_iterations=5",
+    "run", "--source", SOURCE, "--method", "dense", "--quiet", "--no-pictures", "--set", "first_frame.max_iterations=5",
     "--set", "first_frame.points=recording",
 ]  # fmt: skip
 
@@ -50,6 +50,14 @@ class Spoilt(Hold):  # type: ignore[misc]  # wrong on purpose
 
 def spoilt(wrong) -> StreamingMethod:
     return type("Wrong", (Spoilt,), {"spoil": lambda _, step: wrong(step)})()
+
+
+def stepped(part: StreamingMethod, repeat: bool = False, **changes: Any) -> Any:
+    """Frame 1 after frame 0, by a whole method; ``repeat``: the recipe's ``stream.on_error``."""
+    subject = repeating(MethodUnderTest("dense", part)) if repeat else MethodUnderTest("dense", part)
+    subject.parts = replace(subject.parts, **changes)
+    start = subject.begin(open_source(SOURCE).frame(0))
+    return subject.step(start.state, open_source(SOURCE).frame(1))
 
 
 def with_scene(step, **changes):
@@ -100,6 +108,15 @@ def misname(step):
     return replace(step, status="delta")
 
 
+def another_frame(step):
+    packet, player = send_delta(step.state.player, Delta())
+    return replace(step, packet=packet, state=StaticState(player))
+
+
+def fail(_step):
+    raise RuntimeError("out of ideas")
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
@@ -112,14 +129,14 @@ def misname(step):
         (regroup, "packet: scene: groups"),
         (lambda step: replace(step, metrics={"loss": 0.5}), "its step has metrics (loss): write numbers to tools.log"),
         (misname, "expected a packet of frame 1 of the kind it says, 'delta'; got 'empty' of frame 1"),
+        (another_frame, "got 'empty' of frame 2"),
+        (fail, "failed at frame 1: RuntimeError: out of ideas"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
 def test_a_state_that_players_do_not_have_is_an_error(wrong, message: str) -> None:
-    subject = MethodUnderTest("dense", spoilt(wrong))
-    start = subject.begin(open_source(SOURCE).frame(0))
     with pytest.raises(ComponentError) as caught:
-        subject.step(start.state, open_source(SOURCE).frame(1))
+        stepped(spoilt(wrong))
     assert message in str(caught.value)
     assert (caught.value.slot, caught.value.part, caught.value.frame) == ("streaming_method", "Wrong", 1)
 
@@ -129,11 +146,8 @@ def test_a_packet_that_lies_about_what_it_was_decoded_to_is_found_where_every_st
         wrong = drift(step)
         return replace(wrong, packet=replace(wrong.packet, decoded=wrong.state.player))
 
-    subject = MethodUnderTest("dense", spoilt(lie))
-    subject.parts = replace(subject.parts, checks=Checks.STEP)
-    start = subject.begin(open_source(SOURCE).frame(0))
     with pytest.raises(ComponentError, match=r"means is off by up to 0\.25"):
-        subject.step(start.state, open_source(SOURCE).frame(1))
+        stepped(spoilt(lie), checks=Checks.STEP)
     with pytest.raises(AssertionError, match="drifted by"):
         check_method_closed_loop(MethodUnderTest("dense", spoilt(lie)))
 
@@ -149,29 +163,6 @@ def test_groups_are_compared_field_by_field(begun, field: str, value: Any) -> No
     claimed = replace(player, scene=replace(player.scene, groups=replace(groups, **{field: value})))
     assert difference_between(known, replace(known)) == ""
     assert difference_between(known, claimed) == f"scene: groups, {field}"
-
-
-def test_a_packet_of_another_frame_is_an_error() -> None:
-    def repeat(step):
-        packet, player = send_delta(step.state.player, Delta())
-        return replace(step, packet=packet, state=StaticState(player))
-
-    subject = MethodUnderTest("dense", spoilt(repeat))
-    start = subject.begin(open_source(SOURCE).frame(0))
-    with pytest.raises(ComponentError, match=r"expected a packet of frame 1 .* got 'empty' of frame 2"):
-        subject.step(start.state, open_source(SOURCE).frame(1))
-
-
-def test_what_a_method_raises_is_reported_with_its_name() -> None:
-    def fail(step):
-        raise RuntimeError("out of ideas")
-
-    subject = MethodUnderTest("dense", spoilt(fail))
-    start = subject.begin(open_source(SOURCE).frame(0))
-    with pytest.raises(
-        ComponentError, match=r"streaming_method 'Wrong' .* failed at frame 1: RuntimeError: out of ideas"
-    ):
-        subject.step(start.state, open_source(SOURCE).frame(1))
 
 
 def repeating(subject: MethodUnderTest) -> MethodUnderTest:
@@ -207,27 +198,13 @@ def test_a_failed_frame_is_repeated_when_the_recipe_says_so() -> None:
     assert "error" not in after.metrics
 
 
-def test_a_method_that_cannot_skip_either_ends_the_run() -> None:
-    def busy(step):
-        raise RuntimeError("out of ideas")
+class Stubborn(Follow):  # type: ignore[misc]  # wrong on purpose
+    """Sends something in place of a frame that failed."""
 
-    subject = repeating(MethodUnderTest("dense", spoilt(busy)))
-    start = subject.begin(open_source(SOURCE).frame(0))
-    with pytest.raises(ComponentError, match="out of ideas"):
-        subject.step(start.state, open_source(SOURCE).frame(1))
-
-
-def test_what_is_sent_in_place_of_a_failed_frame_must_be_empty() -> None:
-    class Stubborn(Follow):
-        def step(self, state, frame, tools):
-            if frame.epoch_scale > 0:
-                raise RuntimeError("out of ideas")
-            return super().step(state, replace(frame, epoch_scale=1.0), tools)
-
-    subject = repeating(MethodUnderTest("dense", Stubborn()))
-    start = subject.begin(open_source(SOURCE).frame(0))
-    with pytest.raises(ComponentError, match="out of ideas"):
-        subject.step(start.state, open_source(SOURCE).frame(1))
+    def step(self, state, frame, tools):
+        if frame.epoch_scale > 0:
+            raise RuntimeError("out of ideas")
+        return super().step(state, replace(frame, epoch_scale=1.0), tools)
 
 
 class Ponders(Hold):  # type: ignore[misc]  # wrong on purpose
@@ -238,8 +215,8 @@ class Ponders(Hold):  # type: ignore[misc]  # wrong on purpose
         return self.ponder(state, step, frame)
 
 
-def pondering(ponder) -> MethodUnderTest:
-    return MethodUnderTest("dense", type("Wrong", (Ponders,), {"ponder": lambda _, *given: ponder(*given)})())
+def pondering(ponder) -> StreamingMethod:
+    return type("Wrong", (Ponders,), {"ponder": lambda _, *given: ponder(*given)})()
 
 
 @dataclass(frozen=True)
@@ -258,7 +235,7 @@ def test_the_packet_is_out_before_the_work_that_follows_it() -> None:
         assert state.player.frame == frame.index - 1
         return replace(step, state=Thought(step.state.player, frame.index))
 
-    subject = pondering(ponder)
+    subject = MethodUnderTest("dense", pondering(ponder))
     source = open_source(SOURCE)
     listeners = Callbacks(packet=lambda packet: told.append(("packet", packet.frame)))
     encoder = Encoder(subject.parts, source.info, lambda _: source.points("recording"), callbacks=listeners)
@@ -295,10 +272,8 @@ def swap_status(_state, step, _frame):
     ids=["packet", "status", "player", "metrics"],
 )
 def test_what_has_been_handed_out_is_not_changed_afterwards(wrong, message: str) -> None:
-    subject = pondering(wrong)
-    start = subject.begin(open_source(SOURCE).frame(0))
     with pytest.raises(ComponentError, match="its follow_up changed what has been handed out: ") as caught:
-        subject.step(start.state, open_source(SOURCE).frame(1))
+        stepped(pondering(wrong))
     assert message in str(caught.value)
     assert (caught.value.slot, caught.value.part, caught.value.frame) == ("streaming_method", "Wrong", 1)
 
@@ -312,7 +287,7 @@ def test_what_fails_after_a_packet_leaves_the_encoder_as_it_was_and_gives_the_pa
             raise RuntimeError("out of ideas")
         return step
 
-    subject, source = pondering(ponder), open_source(SOURCE)
+    subject, source = MethodUnderTest("dense", pondering(ponder)), open_source(SOURCE)
     listeners = Callbacks(packet=sent.append)
     encoder = Encoder(subject.parts, source.info, lambda _: source.points("recording"), callbacks=listeners)
     before = encoder.encode(source.frame(0)).state
@@ -335,26 +310,20 @@ def test_what_fails_after_a_packet_is_left_out_when_the_recipe_says_so() -> None
             raise RuntimeError("out of ideas")
         return replace(step, state=Thought(step.state.player, -1))
 
-    subject, source = repeating(pondering(ponder)), open_source(SOURCE)
-    start = subject.begin(source.frame(0))
-    with pytest.warns(
-        SkippedWorkWarning, match=r"frame 1: its packet is sound, but .* left out: streaming_method 'Wrong'"
-    ):
-        step = subject.step(start.state, source.frame(1))
+    said = r"frame 1: its packet is sound, but .* left out: streaming_method 'Wrong'"
+    with pytest.warns(SkippedWorkWarning, match=said):
+        step = stepped(pondering(ponder), repeat=True)
     assert asked == [1, 0]
     assert step.state.about == -1
     assert "out of ideas" in step.metrics["error"]
     assert step.metrics["seconds"]["failed"] > 0
 
 
-def test_work_that_cannot_be_left_out_either_ends_the_run() -> None:
-    def ponder(state, step, frame):
-        raise RuntimeError("out of ideas")
-
-    subject = repeating(pondering(ponder))
-    start = subject.begin(open_source(SOURCE).frame(0))
+@pytest.mark.parametrize("part", [spoilt(fail), Stubborn(), pondering(lambda *_: fail(None))], ids=repr)
+def test_what_cannot_be_skipped_either_ends_the_run(part: StreamingMethod) -> None:
+    """A step, what is sent in its place and is not empty, and the work after a packet."""
     with pytest.raises(ComponentError, match="out of ideas"):
-        subject.step(start.state, open_source(SOURCE).frame(1))
+        stepped(part, repeat=True)
 
 
 class Tires(Follow):  # type: ignore[misc]  # wrong on purpose
@@ -417,26 +386,12 @@ def test_settings_of_a_whole_method() -> None:
 
 def test_any_recipe_may_name_one(tmp_path: Path) -> None:
     """``--set whole=NAME`` is enough to run a part that ships no recipe."""
-    command = [text if text != "hold" else "dense" for text in RUN]
-    assert run_command([*command, "--set", "streaming_method=hold", "--out", str(tmp_path / "o")]) == 0
+    assert run_command([*RUN, "--set", "streaming_method=hold", "--out", str(tmp_path / "o")]) == 0
     with Playback(tmp_path / "o" / "stream.gss") as playback:
         assert [playback.entry(f).kind for f in playback.frames] == [PacketKind.KEY, *[PacketKind.EMPTY] * 3]
-
-
-def test_a_held_scene_is_frame_0(tmp_path: Path) -> None:
-    out = tmp_path / "o"
-    assert run_command([*RUN, "--out", str(out)]) == 0
-    with Playback(out / "stream.gss") as playback:
         assert len({playback.state_at(frame).means.tobytes() for frame in playback.frames}) == 1
-    assert run_command(["info", str(out)]) == 0
-    assert run_command(["evaluate", str(out), "--source", SOURCE]) == 0
-
-
-def test_resuming_with_other_settings_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "o"
-    assert run_command([*RUN, "--out", str(out)]) == 0
-    assert run_command([*RUN, "--out", str(out), "--resume", "--set", "seed=5"]) == 2
-    assert "the stream was written with another recipe: seed differ" in capsys.readouterr().err
+    assert run_command(["info", str(tmp_path / "o")]) == 0
+    assert run_command(["evaluate", str(tmp_path / "o"), "--source", SOURCE]) == 0
 
 
 def test_the_benchmark_of_the_parts_refuses_a_whole_method(capsys: pytest.CaptureFixture[str]) -> None:

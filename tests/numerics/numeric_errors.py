@@ -16,7 +16,6 @@ from gsstream.player.software import render_numpy
 from gsstream.testing.cases import rig
 
 Measure = Callable[[int], float]
-NATIVE = "gsstream_cpu_render"
 
 
 def cameras_error(seed: int) -> float:

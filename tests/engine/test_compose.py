@@ -1,16 +1,20 @@
-"""A method that is composed in Python is the method that the same names and settings make."""
+"""A method that is composed in Python is the method of the same names; how many calls lie below a command."""
 
 from __future__ import annotations
 
 import re
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError
 from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.encode import Encoder, encoder_for, encoder_for_rig, open_recording
 from gsstream.engine.assembly.live import with_live
+from gsstream.engine.method.parts import PartsMethod
 from gsstream.method.static import Hold
 from gsstream.parts.motion.none import Still
 from gsstream.parts.motion.rigid import Rigid
@@ -87,3 +91,27 @@ def test_a_part_that_no_plugin_declares_is_called_by_its_class() -> None:
     assert made.parts.recipe.motion.name == "studio:Mine"
     assert re.search(r"studio:Mine\"? +# Python$", to_yaml(made.parts.resolved), re.MULTILINE)
     assert packets(made)[1] == packets(encoder({}, motion="rigid"))[1]
+
+
+@pytest.mark.parametrize("settings", [(), ("--set", "stream.on_error=repeat", "--budget", "size=50KB")])
+def test_a_method_is_at_most_six_calls_below_the_command(
+    settings: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[list[str]] = []
+    step = PartsMethod.step
+
+    def watched(*arguments: object) -> object:
+        frame, names = sys._getframe(1), []
+        while frame is not None:
+            names.append(f"{frame.f_globals['__name__']}.{frame.f_code.co_name}")
+            frame = frame.f_back
+        seen.append(names)
+        return step(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(PartsMethod, "step", watched)
+    command = ["run", "--source", "synthetic:frames=2&views=3&width=32&height=24&supersample=1", "--method", "dense"]
+    tiny = ["--set", "first_frame.max_iterations=4", "--quiet", "--no-pictures", "--no-video", "--out", str(tmp_path)]
+    assert run_command([*command, *tiny, *settings]) == 0
+    (names,) = seen
+    depth = names.index("gsstream.cli.run.run")
+    assert depth < 6, names[: depth + 1]

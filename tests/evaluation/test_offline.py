@@ -1,17 +1,21 @@
-"""Sequences and pictures of methods trained elsewhere, tried on a stream's own export and its own pictures."""
+"""Sequences and pictures of methods trained elsewhere, and recordings that streams of others name."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from test_player import ARC, look_at
 
 from gsstream.cli.main import run_command
+from gsstream.core.changes import Layout
 from gsstream.core.errors import InputError
 from gsstream.evaluation.offline import bytes_line, numbered
+from gsstream.packet import KeyState, StreamMeta, StreamWriter, encode_key
 from gsstream.player.ply import ply_bytes, read_ply
 from tests.scenes import make_scene
 
@@ -169,3 +173,44 @@ def test_bytes_of_folders_count_all_that_is_in_them(tmp_path: Path) -> None:
 def test_options_that_would_do_nothing_are_refused(capsys, arguments: list[str], said: str) -> None:
     assert run_command(["evaluate", *arguments]) == 2
     assert said in capsys.readouterr().err
+
+
+def hostile_stream(path, **changes):
+    rig, scene = look_at(ARC), make_scene(5)
+    meta = StreamMeta("dense", "test", {}, rig.select([0, 1, 2]), rig.select([3]), 25.0)
+    layout = Layout(np.ones(5, np.int32), np.zeros(5, np.uint8), np.float32([1]))
+    with StreamWriter.open(path) as writer:
+        writer.append(encode_key(KeyState(scene, layout, dataclasses.replace(meta, **changes))))
+    return path
+
+
+@pytest.mark.parametrize(
+    "uri", ["watch:DIR?timeout=86400", "disturbed:gain=2:watch:DIR", "watch:", "disturbed::watch:x"]
+)
+def test_a_stream_cannot_make_it_wait(uri, tmp_path, capsys) -> None:
+    path = hostile_stream(tmp_path / "s.gss", extra={"source_uri": uri.replace("DIR", str(tmp_path))})
+    assert run_command(["evaluate", str(path)]) == 2
+    assert "name it yourself with --source" in capsys.readouterr().err
+
+
+RECIPES = {
+    "scale": [{"scale": value} for value in ("x", None, 0, -1, 2, True, [1])],
+    "seed": [{"seed": value} for value in ([], "7", None, 1.5)],
+}
+
+
+@pytest.mark.parametrize("key", RECIPES)
+def test_recipes_that_no_run_can_have_had_are_refused(key, tmp_path, capsys) -> None:
+    for i, recipe in enumerate(RECIPES[key]):
+        path = hostile_stream(tmp_path / f"{i}.gss", recipe=recipe, extra={"source_uri": "demo"})
+        assert run_command(["evaluate", str(path)]) == 2
+        assert f"its recipe says {key} = " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("uri", ["x" * 5000, "folder:" + "y" * 5000, "\0", "a\nb\x1b[2J"])
+def test_names_that_are_no_files_are_refused_in_one_line(uri, tmp_path, capsys) -> None:
+    path = hostile_stream(tmp_path / "s.gss", extra={"source_uri": uri})
+    assert run_command(["evaluate", str(path)]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("error: ")
+    assert "\x1b" not in err

@@ -1,8 +1,9 @@
-"""Every layout: cameras project as its own documentation says, pictures are those on disk, the split holds."""
+"""Every layout: its own way to project, its pictures, its split, and a run on it from end to end."""
 
 from __future__ import annotations
 
 import importlib.util
+import json
 import shutil
 import subprocess
 import sys
@@ -12,12 +13,14 @@ import numpy as np
 import pytest
 from scenes import LAYOUTS, World, make_world, tracks, world_points, write_colmap, write_n3dv, write_ply
 
+from gsstream.cli.main import run_command
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.input.recordings.open import open_source
 from gsstream.input.recordings.options import DataOptions
 from gsstream.input.recordings.recorded import RecordedSource
 from gsstream.input.recordings.transformed import transformed
+from gsstream.player.playback import Playback
 
 
 @pytest.fixture(scope="module")
@@ -158,3 +161,28 @@ def test_no_layout_and_several_layouts_are_told_apart(tmp_path: Path, world: Wor
     assert isinstance(open_source(f"colmap:{folder}"), RecordedSource)
     with pytest.raises(SourceError, match=r"no such folder; expected transforms\.json"):
         open_source(f"nerfstudio:{tmp_path / 'absent'}")
+
+
+TINY = {
+    "first_frame.max_iterations": 12, "first_frame.max_points": 300,
+    "stream.epochs": 1,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["n3dv", "meetroom", "enerf", "panoptic", "colmap text", "nerfstudio timed"])
+def test_three_frames(tmp_path: Path, world: World, name: str) -> None:
+    layout = LAYOUTS[name]
+    folder = layout.write(tmp_path / "scene", world)
+    settings = [item for key, value in TINY.items() for item in ("--set", f"{key}={value}")]
+    if not layout.test:
+        settings += ["--set", f'data.test_cameras=["{layout.names(0)}"]']
+    out = tmp_path / "out"
+    command = ["run", "--source", str(folder), "--method", "s2gs-edge", "--out", str(out), "--quiet", "--no-pictures"]
+    assert run_command([*command, *settings]) == 0
+    lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert [line["frame"] for line in lines] == [0, 1, 2]
+    assert all(list(line["psnr"]) == [layout.names(0)] for line in lines)
+    with Playback(out / "stream.gss") as playback:
+        assert playback.meta.test.ids == (layout.names(0),)
+        assert len(playback.meta.train.ids) == 3
+        assert playback.meta.extra["source_uri"] == str(folder)

@@ -1,16 +1,19 @@
-"""The sphere of seeds behind the scene: where it lies for rigs of all kinds, its colours, and what is counted to it."""
+"""The sphere of seeds behind the scene, and means over windows of pictures."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from rigs import HEIGHT, WIDTH, in_line, inwards, looking, outwards, parallel
+from scipy.ndimage import uniform_filter
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.projection import project
 from gsstream.input.seeds.geometry import focus_point
 from gsstream.input.seeds.shell import BEYOND, RADIUS, SEEDS, find_shell, in_shell, mean_color, shell_points
 from gsstream.input.seeds.shell import WIDTH as OVERLAP
+from gsstream.input.seeds.window import window_mean
 
 RIGS = {
     "a ring": inwards(6, 360), "an arc": inwards(5, 60), "two face to face": inwards(2, 180),
@@ -86,3 +89,25 @@ def test_the_mean_colour_is_that_of_all_pixels() -> None:
     images[0, ..., 0], images[1, 0, 0, 2] = 1, 0.5
     assert mean_color(images) == pytest.approx((0.5, 0, 0.5 / 24))
     assert mean_color(np.full((1, 2, 2, 3), 1 + 1e-5, np.float32)) == (1, 1, 1), "rounding does not leave [0, 1]"
+
+
+@pytest.mark.parametrize("half", [0, 1, 2, 3, 6, 7, 11])
+@pytest.mark.parametrize("shape", [(3, 1, 17, 23), (1, 1, 1, 5), (2, 1, 4, 1)])
+def test_it_is_the_mean_of_another_implementation(half: int, shape: tuple[int, ...]) -> None:
+    images = torch.rand(shape, generator=torch.Generator().manual_seed(half))
+    expected = [uniform_filter(image[0].numpy().astype(np.float64), 2 * half + 1, mode="nearest") for image in images]
+    np.testing.assert_allclose(window_mean(images, half)[:, 0].numpy(), np.stack(expected), rtol=2e-6, atol=1e-7)
+
+
+def test_an_image_of_one_colour_stays_so() -> None:
+    images = torch.full((1, 1, 9, 8), 0.3)
+    torch.testing.assert_close(window_mean(images, 6), images, rtol=1e-6, atol=0)
+    assert torch.equal(images, torch.full((1, 1, 9, 8), 0.3))  # what was given is not written to
+
+
+def test_windows_do_not_write_to_what_they_were_given() -> None:
+    images = torch.rand(2, 1, 12, 12, generator=torch.Generator().manual_seed(1))
+    before = images.clone()
+    for half in (0, 2, 6):
+        window_mean(images, half)
+    assert torch.equal(images, before)

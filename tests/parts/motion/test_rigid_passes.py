@@ -1,18 +1,31 @@
-"""Where the fit of motion looks, and how often: near a change, and in a hurried frame less."""
+"""Motions beside the rest of a frame: where they are looked for, in which unit, how often, how many bytes."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any, Literal
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 
-from gsstream.engine.step.active.change import Change
+from gsstream.core.cameras import Cameras
+from gsstream.core.picture_size import enlargement
+from gsstream.core.rng import Rng
+from gsstream.engine.budget.epoch_scheduler import Allowance
+from gsstream.engine.budget.plan import FramePlan
+from gsstream.engine.step.active.change import Change, detect_changed_tiles
+from gsstream.engine.step.motion import Moved, propose_motion
+from gsstream.engine.step.tools import RunTools
+from gsstream.input.recordings.open import open_source
+from gsstream.packet.changes.motion import encode_motions
+from gsstream.parts.motion.constant_velocity import Coasting
+from gsstream.parts.motion.groups import pixel_size
 from gsstream.parts.motion.rigid import Rigid
 from gsstream.parts.render.wrt import WrtRows
-from gsstream.testing.working import FitFixture, fit_fixture
+from gsstream.testing.method_driver import SOURCE
+from gsstream.testing.working import FitFixture, fit_fixture, method_with
 
 
 def near_by_hand(tiles: np.ndarray) -> np.ndarray:
@@ -92,3 +105,53 @@ def test_motions_look_everywhere_unless_told_to_look_near_the_change(
     monkeypatch.setattr("gsstream.core.picture_size.LARGE", large)
     Rigid(Rigid.Config(everywhere=everywhere)).propose(case.scene, case.work, case.rng)
     assert set(asked) == {tiles}
+
+
+def within(max_bytes: int | None) -> Moved:
+    parts = method_with("motion", Coasting(Coasting.Config(votes=0, share=0, displaced=0, asked=0))).parts
+    state = method_with("motion", Coasting()).chain()[1].state
+    frame = replace(open_source(SOURCE).frame(2), cameras=state.previous.cameras)
+    plan = FramePlan(epochs=1, change_threshold=6.0, rd_lambda=0.0, max_bytes=max_bytes)
+    change = detect_changed_tiles(state.previous, frame, 6.0)
+    tools = RunTools(parts, Rng(0), Mock(), Mock(), budget=Allowance(plan, 0.0, float))
+    return propose_motion(parts, state, frame, change, tools)
+
+
+@pytest.mark.parametrize("spare", [0, -1])
+def test_motions_take_half_of_a_frame_at_most(spare: int) -> None:
+    free = within(None)
+    assert sum(int(motion.moving.sum()) for motion in free.motions) > 0
+    size = sum(len(data) for _, data in encode_motions(free.motions))
+    held = within(2 * size + spare)
+    assert len(held.motions) == (len(free.motions) if spare == 0 else 0)
+    before = method_with("motion", Coasting()).chain()[1].state.player.gaussians.means
+    went = (held.scene.gaussians.means != before).any()
+    assert bool(went) == (spare == 0), "what is not sent is not moved either"
+
+
+def test_it_is_the_median_over_cameras_and_gaussians_of_distance_over_focal_length() -> None:
+    rng = np.random.default_rng(3)
+    means = rng.normal(size=(101, 3)).astype(np.float32)
+    viewmats = np.tile(np.eye(4), (4, 1, 1))
+    viewmats[:, :3, 3] = rng.normal(size=(4, 3)) * 5
+    Ks = np.tile(np.eye(3), (4, 1, 1))
+    Ks[:, 0, 0] = Ks[:, 1, 1] = [50.0, 60.0, 70.0, 80.0]
+    cameras = Cameras(tuple("abcd"), viewmats, Ks, 32, 24)
+    widths = [
+        np.linalg.norm(means - at, axis=1) / K[0, 0] for at, K in zip(cameras.centers, cameras.Ks, strict=True)
+    ]
+    # To the bit: a step of motions is made of it, and a stream's bytes with it.
+    assert pixel_size(means, cameras) == float(np.median(np.concatenate(widths)))
+
+
+@pytest.mark.parametrize("times", [1, 2, 4.225])
+def test_lengths_in_pixels_mean_the_same_in_the_scene_at_every_size_of_picture(times: float) -> None:
+    """Sides of groups and longest steps are some pixels times both, so a recipe fits the same recording at any size."""
+    means = np.random.default_rng(3).normal(size=(50, 3)).astype(np.float32)
+    viewmats = np.tile(np.eye(4), (2, 1, 1))
+    viewmats[:, 2, 3] = 7.0
+    K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+    small = Cameras(("a", "b"), viewmats, np.stack([K, K]), 320, 240)
+    large = small.scaled(round(320 * times), round(240 * times))
+    length = pixel_size(means, large) * enlargement(large.width)
+    assert length == pytest.approx(pixel_size(means, small), rel=1e-12)

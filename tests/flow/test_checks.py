@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -162,67 +162,65 @@ def failure(parts: Assembly, out: Path) -> GsstreamError:
     return caught.value
 
 
-@pytest.mark.parametrize(("gate", "got"), [(WrongGate, "got nan"), (TooOpen, "got 1.25")])
-def test_step_names_part_frame_iteration_and_index(tmp_path: Path, gate: Callable[[], GateSampler], got: str) -> None:
-    error = failure(assembly("step", gate=gate()), tmp_path)
+class Found(NamedTuple):
+    """A run with a wrong part, and what is said of it: slot, part, frame, iteration, words."""
+
+    parts: dict[str, Callable[[], Any]]
+    place: tuple[str, str, int, int | None]
+    words: tuple[str, ...]
+    level: str = "step"
+    method: str = "dense"
+    calls: int = 0
+    iterations: int = 0
+
+
+#: Frame 0 is not trained unless it says so: the fourth render is iteration 3 of frame 1.
+FOUND = {
+    "a gate that is no number": Found(
+        {"gate": WrongGate}, ("gate", "WrongGate", 1, 3),
+        ("sample(): expected finite values from 0 to 1, got nan at index [5] (1 of ",),
+    ),
+    "a gate above 1": Found(
+        {"gate": TooOpen}, ("gate", "TooOpen", 1, 3), ("finite values from 0 to 1, got 1.25 at index [5] (1 of ",)
+    ),
+    "a pixel": Found(
+        {"renderer": WrongRenderer}, ("renderer", "WrongRenderer", 1, 3),
+        ("image of view ", "got nan at index [7, 9, 0] (3 of 1152 values)"),
+    ),
+    "a loss": Found({"loss": WrongLoss}, ("loss", "WrongLoss", 1, 3), ("got inf",)),
+    "frame 0, whose iterations count from 1": Found(
+        {"renderer": WrongRenderer}, ("renderer", "WrongRenderer", 0, 4), (), iterations=6
+    ),
+    "a whole method": Found({"loss": WrongLoss}, ("loss", "WrongLoss", 1, 4), (), method="queen"),
+    "a step of the optimiser": Found({"optimiser": WrongOptimiser}, ("optimiser", "WrongOptimiser", 1, 3), ()),
+    "a gradient": Found(
+        {"loss": WrongGradient}, ("loss", "WrongGradient", 1, 3), ("got nan at index [7, 9, 0]",)
+    ),
+    # The default: what was learned is looked at before it is sent, so that no such stream exists.
+    # The last of nine steps: the native loss refuses a picture that is not finite.
+    "at the end of a frame": Found(
+        {"renderer": ReferenceRenderer, "optimiser": WrongOptimiser}, ("update", "Additive", 1, None),
+        ("GSSTREAM_CHECKS=step finds the first", "got nan at index [4, 0] (Gaussian 4)"), "frame", calls=-5,
+    ),
+    "what one part refuses of another": Found(
+        {"loss": WrongGradient}, ("optimiser", "CpuAdam", 1, 3), ("got nan in row ",), "frame"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", FOUND)
+def test_a_wrong_number_is_named_with_its_place(tmp_path: Path, what: str) -> None:
+    row = FOUND[what]
+    parts = assembly(row.level, row.method, **{slot: make() for slot, make in row.parts.items()})
+    if row.iterations:
+        first = parts.recipe.first_frame.model_copy(update={"max_iterations": row.iterations})
+        parts = replace(parts, recipe=parts.recipe.model_copy(update={"first_frame": first}))
+    COUNTER.calls = row.calls
+    error = failure(parts, tmp_path)
     assert isinstance(error, ComponentError)
-    assert (error.slot, error.part, error.frame, error.iteration) == ("gate", gate.__name__, 1, 3)
-    assert f"sample(): expected finite values from 0 to 1, {got} at index [5] (1 of " in str(error)
-
-
-def test_step_names_a_pixel(tmp_path: Path) -> None:
-    """Frame 0 is not trained here: the fourth render is iteration 3 of frame 1."""
-    error = failure(assembly("step", renderer=WrongRenderer()), tmp_path)
-    assert isinstance(error, ComponentError)
-    assert (error.slot, error.part, error.frame, error.iteration) == ("renderer", "WrongRenderer", 1, 3)
-    assert "image of view " in str(error)
-    assert "got nan at index [7, 9, 0] (3 of 1152 values)" in str(error)
-
-
-def test_step_names_a_loss(tmp_path: Path) -> None:
-    error = failure(assembly("step", loss=WrongLoss()), tmp_path)
-    assert isinstance(error, ComponentError)
-    assert (error.slot, error.part, error.frame, error.iteration) == ("loss", "WrongLoss", 1, 3)
-    assert "got inf" in str(error)
-
-
-def test_step_looks_at_frame_0_and_at_whole_methods_too(tmp_path: Path) -> None:
-    parts = assembly("step", renderer=WrongRenderer())
-    first = parts.recipe.first_frame.model_copy(update={"max_iterations": 6})
-    error = failure(replace(parts, recipe=parts.recipe.model_copy(update={"first_frame": first})), tmp_path / "a")
-    assert isinstance(error, ComponentError)
-    assert (error.slot, error.frame, error.iteration) == ("renderer", 0, 4), "iterations of frame 0 count from 1"
-    COUNTER.calls = 0
-    error = failure(assembly("step", "queen", loss=WrongLoss()), tmp_path / "b")
-    assert isinstance(error, ComponentError)
-    assert (error.slot, error.part, error.frame, error.iteration) == ("loss", "WrongLoss", 1, 4)
-
-
-def test_frame_finds_at_the_end_of_the_frame_what_step_finds_at_once(tmp_path: Path) -> None:
-    """The default: what was learned is looked at before it is sent, so that no such stream exists."""
-    parts = assembly("frame", renderer=ReferenceRenderer(), optimiser=WrongOptimiser())
-    COUNTER.calls = -5  # the last of nine steps: the native loss refuses a picture that is not finite
-    error = failure(parts, tmp_path / "frame")
-    assert isinstance(error, ComponentError)
-    assert (error.slot, error.frame, error.iteration) == ("update", 1, None)
-    assert "GSSTREAM_CHECKS=step finds the first" in str(error)
-    assert "got nan at index [4, 0] (Gaussian 4)" in str(error)
-    COUNTER.calls = 0
-    error = failure(assembly("step", optimiser=WrongOptimiser()), tmp_path / "optimiser")
-    assert isinstance(error, ComponentError)
-    assert (error.slot, error.part, error.frame, error.iteration) == ("optimiser", "WrongOptimiser", 1, 3)
-    COUNTER.calls = 0
-    error = failure(assembly("step", loss=WrongGradient()), tmp_path / "step")
-    assert isinstance(error, ComponentError)
-    assert (error.slot, error.part, error.frame, error.iteration) == ("loss", "WrongGradient", 1, 3)
-    assert "got nan at index [7, 9, 0]" in str(error)
-
-
-def test_what_one_part_refuses_of_another_is_said_with_its_place(tmp_path: Path) -> None:
-    error = failure(assembly("frame", loss=WrongGradient()), tmp_path)
-    assert isinstance(error, ComponentError)
-    assert (error.slot, error.frame, error.iteration) == ("optimiser", 1, 3)
-    assert "got nan in row " in str(error)
+    assert (error.slot, error.part, error.frame, error.iteration) == row.place
+    for words in row.words:
+        assert words in str(error)
 
 
 def test_a_residual_beyond_32_bits_is_refused(tmp_path: Path) -> None:

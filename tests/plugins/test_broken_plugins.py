@@ -31,27 +31,20 @@ REASONS = {
 }
 
 
-@pytest.mark.parametrize("fault", REASONS)
-def test_listed_with_its_reason_while_the_rest_works(lab, fault: str) -> None:
-    lab.install(fault)
-    listing = lab.cli("plugins")
-    assert listing.returncode == 0, listing.stderr
-    (line,) = [line for line in listing.stdout.splitlines() if line.startswith(f"{fault} ")]
-    assert f"gsstream-{fault.replace('_', '-')} 0.3" in line
-    assert f"quarantined: {REASONS[fault]}" in line
-    assert "always-open" in listing.stdout
-    methods = lab.cli("methods")
-    assert methods.returncode == 0
-    assert methods.stdout.splitlines()[1].startswith("dense")
-    assert REASONS[fault] in methods.stderr
-
-
-def test_all_faults_at_once(lab) -> None:
+def test_each_is_listed_with_its_reason_while_the_rest_works(lab) -> None:
+    """All of them at once."""
     for fault in REASONS:
         lab.install(fault)
-    listing = lab.cli("plugins")
-    assert listing.returncode == 0, listing.stderr
+    listing, methods = lab.cli("plugins"), lab.cli("methods")
+    assert (listing.returncode, methods.returncode) == (0, 0), listing.stderr + methods.stderr
+    for fault, reason in REASONS.items():
+        (line,) = [line for line in listing.stdout.splitlines() if line.startswith(f"{fault} ")]
+        assert f"gsstream-{fault.replace('_', '-')} 0.3" in line
+        assert f"quarantined: {reason}" in line
+        assert reason in methods.stderr
     assert listing.stdout.count("quarantined: ") == len(REASONS)
+    assert "always-open" in listing.stdout
+    assert methods.stdout.splitlines()[1].startswith("dense")
     assert lab.cli("recipe", "dense").returncode == 0
 
 

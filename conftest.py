@@ -27,7 +27,7 @@ ROOT = Path(__file__).parent
 #: while the others wait. A name that is missing here costs only time.
 LONG = (
     "flow/test_closed_loop", "flow/test_repeat_and_resume", "flow/test_resume", "flow/test_key_refresh",
-    "lab/tests/test_sweep_ray",
+    "lab/tests/test_sweep_real",
     "cpu_render/tests/test_cross_aarch64", "contract/test_new_plugin", "contract/test_howtos",
     "plugins/test_six_rings", "lab/tests/test_paper_configs", "web/test_page", "flow/test_budget",
     "contract/test_saboteurs", "contract/test_shipped_plugins", "flow/test_no_overshoot", "web/test_live_page",
@@ -35,8 +35,8 @@ LONG = (
     "flow/test_cost_follows_change", "flow/test_bad_input",
     "web/test_page_joins", "flow/test_checks", "packet/test_fuzz", "flow/test_run_ends", "flow/test_watch",
     "flow/test_worlds", "input/prepare/test_validate", "lab/tests/test_tune", "queen/tests/test_queen_stream",
-    "tools/test_soak", "flow/test_still_frames", "packet/test_corrupt", "input/seeds/test_init_sfm",
-    "input/recordings/test_layouts", "lab/tests/test_sweep_real", "tools/test_cost_scripts",
+    "tools/test_soak", "flow/test_still_frames", "packet/test_corrupt", "input/seeds/test_depth_maps",
+    "input/recordings/test_layouts", "tools/test_cost_scripts",
     "flow/test_light_process", "player/test_player_memory", "evaluation/test_offline", "lab/tests/test_compare",
 )  # fmt: skip
 #: What ``make check`` runs: rooms whose tests are cheap, and the one test of whole runs that must never fail.

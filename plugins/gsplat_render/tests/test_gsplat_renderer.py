@@ -1,8 +1,4 @@
-"""The renderer contract against the reference renderer: on the GPU where there is one, and everywhere on a stand-in.
-
-The stand-in is gsplat's own torch formulas on the processor and a rasteriser of ours; all else is the code that runs
-on a GPU.
-"""
+"""The renderer contract against the reference renderer: on a GPU where there is one, everywhere on a stand-in."""
 
 from __future__ import annotations
 
@@ -18,6 +14,7 @@ from torch_kernels import TORCH_KERNELS
 
 from gsstream.api import Cameras, Gaussians, PluginUnavailable, RenderOutput, ShapeError
 from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.testing import parametrize_with_checks
 
 N, WIDTH, HEIGHT = 120, 49, 37  # the size is no multiple of a tile
 BACKGROUND = (0.2, 0.5, 0.9)
@@ -255,3 +252,17 @@ def test_the_part_itself_renders(backend: Backend) -> None:
     got = GsplatRenderer().render(scene(), rig(), 0, BACKGROUND)
     want = ReferenceRenderer().render(scene().map(torch.Tensor.double), rig(), 0, BACKGROUND)
     assert_images_agree(backend, got, want)
+
+
+try:
+    load_kernels("cuda")
+except PluginUnavailable as error:
+
+    @pytest.mark.skip(reason=f"needs an NVIDIA GPU with gsplat's kernels: {error}")
+    def test_contract() -> None: ...
+
+else:
+
+    @parametrize_with_checks([GsplatRenderer()])
+    def test_contract(check) -> None:
+        check()

@@ -1,5 +1,4 @@
-"""What the plugin declares, its recipes, and the latent update rule."""
-
+"""What the plugin declares, its contract under other settings, its recipes, and the latent update rule."""
 
 from __future__ import annotations
 
@@ -8,7 +7,14 @@ import math
 import numpy as np
 import pytest
 import torch
+from gsstream_s2gs.error_aware import ErrorAware
+from gsstream_s2gs.expected_sparsity import ExpectedSparsity
+from gsstream_s2gs.gumbel_sigmoid import GumbelSigmoid
 from gsstream_s2gs.latent import LatentCode, LatentResidual
+from gsstream_s2gs.noise_normalised import NoiseNormalised
+from gsstream_s2gs.octree import StreamingOctree
+from gsstream_s2gs.selective_leaf import SelectiveLeaf
+from gsstream_s2gs.view_gradient import ViewSpaceGradient
 from pydantic import ValidationError
 from residual_oracle import train_rows
 from s2gs_scene import gaussians
@@ -18,6 +24,7 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.parts.update.base import init_latents
 from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
+from gsstream.testing import parametrize_with_checks
 
 KINDS = ("structure", "confidence", "propagation", "gate", "regularizer", "update")
 
@@ -134,3 +141,28 @@ def test_residuals_of_offset_and_factor_are_an_offset_to_half_a_symbol() -> None
     assert (np.abs(after - wanted) <= 0.5 * symbol + 1e-5).all()
     assert not symbols[:50].any(), "a factor moves nothing that lies at its anchor"
     assert symbols[50:100].any(axis=1).all()
+
+
+Sparsity, Gate = ExpectedSparsity.Config, GumbelSigmoid.Config
+Octree, Gradient = StreamingOctree.Config, ViewSpaceGradient.Config
+RELEASED = Gradient(loss="l2norm", aggregate="sum-of-norms", normalisation="ratio")
+#: Under other settings than their own; under those: tests/contract/test_shipped_plugins.py.
+PARTS = [
+    StreamingOctree(Octree(gate_level=2)), StreamingOctree(Octree(grouping="gaussian")),
+    ViewSpaceGradient(RELEASED), ViewSpaceGradient(Gradient(normalisation="minmax")),
+    ViewSpaceGradient(Gradient(aggregate="mean-vector", normalisation="ratio")),
+    ViewSpaceGradient(Gradient(aggregate="mean-of-norms", normalisation="ratio")),
+    ViewSpaceGradient(Gradient(normalisation="noise")), ViewSpaceGradient(Gradient(epsilon_mode="relative")),
+    GumbelSigmoid(Gate(levels=1)), GumbelSigmoid(Gate(noise="none")),
+    GumbelSigmoid(Gate(levels=1, clamp_gradient=True)), GumbelSigmoid(Gate(levels=1, noise="gumbel")),
+    GumbelSigmoid(Gate(noise="gumbel")), GumbelSigmoid(Gate(clamp_gradient=True)),
+    GumbelSigmoid(Gate(noise="none", clamp_gradient=True)),
+    ExpectedSparsity(Sparsity(reduction="sum", motion="half-mean")),
+    NoiseNormalised(NoiseNormalised.Config(probes=4)), ErrorAware(ErrorAware.Config(budget=0.0)),
+    SelectiveLeaf(SelectiveLeaf.Config(suspect=-1.0, spread=1.0)),
+]  # fmt: skip
+
+
+@parametrize_with_checks(PARTS)
+def test_contract(check) -> None:
+    check()

@@ -21,17 +21,12 @@ MEASURED = ("motion", "growth")
 
 @dataclass(frozen=True)
 class Subject:
-    """One thing that was checked.
-
-    Arguments:
-        absent: it cannot be made on this machine, so that nothing could be checked.
-        effect: what it does to a tiny recording.
-    """
+    """One thing that was checked."""
 
     heading: str
     results: list[CheckResult]
-    absent: bool = False
-    effect: str = ""
+    absent: bool = False  # it cannot be made on this machine, so that nothing could be checked
+    effect: str = ""  # what it does to a tiny recording
 
 
 def check(

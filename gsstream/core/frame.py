@@ -18,16 +18,12 @@ ROUNDING = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """How a frame of a recording that is still being written came in.
+    """How a frame of a recording that is still being written came in."""
 
-    Arguments:
-        complete: when its last image was complete, by the time of modification of that file: seconds since 1970. None
-            when its files are gone already.
-        absent: training cameras whose image did not come.
-    """
-
+    #: When its last image was complete, by the time of modification of that file: seconds since 1970. None when its
+    #: files are gone already.
     complete: float | None
-    absent: tuple[str, ...] = ()
+    absent: tuple[str, ...] = ()  # training cameras whose image did not come
 
 
 @dataclass(frozen=True, slots=True)

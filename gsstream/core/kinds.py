@@ -17,25 +17,19 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class PartKind:
-    """One kind of part.
+    """One kind of part."""
 
-    Arguments:
-        name: as recipes, plugins and errors write it.
-        contract: "module:Class" of the abstract base class, as text, so that listing kinds imports no torch; None:
-            there is no class to inherit from (a source is anything that is called as ``target(uri, scale)``).
-        slot: a method that is made of parts has one of this kind.
-        default: the part that a recipe names by default; None: recipes have no section of this name.
-        behaviour: the common checks of behaviour (purity, shapes, precision, permutation) are made on it, beside those
-            of settings and declaration, which every kind with a contract gets.
-        use: the options by which a run names such a part, with <name> and <kind>; None: the engine chooses, so a plugin
-            author has nothing to start from.
-    """
-
-    name: str
+    name: str  # as recipes, plugins and errors write it
+    #: "module:Class" of the abstract base class, as text, so that listing kinds imports no torch; None: there is no
+    #: class to inherit from (a source is anything that is called as ``target(uri, scale)``).
     contract: str | None
-    slot: bool = False
-    default: str | None = None
+    slot: bool = False  # a method that is made of parts has one of this kind
+    default: str | None = None  # the part that a recipe names by default; None: recipes have no section of this name
+    #: The common checks of behaviour (purity, shapes, precision, permutation) are made on it, beside those of
+    #: settings and declaration, which every kind with a contract gets.
     behaviour: bool = False
+    #: The options by which a run names such a part, with <name> and <kind>; None: the engine chooses, so a plugin
+    #: author has nothing to start from.
     use: str | None = "--set <kind>=<name> --source demo"
 
     def contract_class(self) -> type[Any]:

@@ -34,18 +34,14 @@ from gsstream.player.render import PlayerRenderer, find_renderer, render
 
 @dataclass(frozen=True, slots=True)
 class ViewPair:
-    """What an extra metric is given: one test camera at one frame, [H, W, 3] in [0, 1], and the frame before it.
-
-    Arguments:
-        last_image, last_truth: of the evaluated frame before; None at the first.
-        sigma: noise of one recorded image.
-    """
+    """What an extra metric is given: one test camera at one frame, [H, W, 3] in [0, 1], and the frame before it."""
 
     image: FloatArray
     truth: FloatArray
+    #: last_image, last_truth: of the evaluated frame before; None at the first.
     last_image: FloatArray | None
     last_truth: FloatArray | None
-    sigma: float
+    sigma: float  # noise of one recorded image
 
 
 #: An extra metric of one view; nan where it is not defined.
@@ -84,19 +80,12 @@ class ViewQuality:
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """All views of all frames.
+    """All views of all frames."""
 
-    Arguments:
-        views: in the order of frames, then cameras.
-        sigmas: camera -> noise of one image, [0, 1] units.
-        renderer: name of the player's renderer.
-        lpips_variant: which LPIPS was measured; None: none, and neither table nor JSON speak of it.
-    """
-
-    views: tuple[ViewQuality, ...]
-    sigmas: Mapping[str, float]
-    renderer: str
-    lpips_variant: str | None = None
+    views: tuple[ViewQuality, ...]  # in the order of frames, then cameras
+    sigmas: Mapping[str, float]  # camera -> noise of one image, [0, 1] units
+    renderer: str  # name of the player's renderer
+    lpips_variant: str | None = None  # which LPIPS was measured; None: none, and neither table nor JSON speak of it
 
     def series(self, name: str) -> dict[int, float]:
         """Return frame -> mean over cameras of a quantity of :class:`ViewQuality`, over views where it is finite."""

@@ -15,31 +15,24 @@ from gsstream.engine.run.metrics_log import read_metrics
 
 @dataclass(frozen=True, slots=True)
 class FrameRecord:
-    """One frame of a run. Quantities that were not measured are empty or nan.
+    """One frame of a run. Quantities that were not measured are empty or nan."""
 
-    Arguments:
-        frame: frame index.
-        psnr, ssim, psnr_moving, psnr_changed: test camera -> value (dB, SSIM 1); cameras where nothing moves, or
-            changes, are left out of the last two.
-        bytes: packet section -> bytes, headers included.
-        seconds: phase -> wall seconds.
-        sent_gaussians, num_gaussians, active_gates, num_gates: counts. open_gates: after each epoch of the frame.
-        peak_memory_mb: peak resident memory so far, MB.
-    """
-
-    frame: int
+    frame: int  # frame index
+    #: psnr, ssim, psnr_moving, psnr_changed: test camera -> value (dB, SSIM 1); cameras where nothing moves, or
+    #: changes, are left out of the last two.
     psnr: Mapping[str, float] = field(default_factory=dict)
     ssim: Mapping[str, float] = field(default_factory=dict)
     psnr_moving: Mapping[str, float] = field(default_factory=dict)
-    bytes: Mapping[str, int] = field(default_factory=dict)
-    seconds: Mapping[str, float] = field(default_factory=dict)
+    bytes: Mapping[str, int] = field(default_factory=dict)  # packet section -> bytes, headers included
+    seconds: Mapping[str, float] = field(default_factory=dict)  # phase -> wall seconds
+    #: sent_gaussians, num_gaussians, active_gates, num_gates: counts.
     sent_gaussians: int = 0
     num_gaussians: int = 0
     active_gates: int = 0
     num_gates: int = 0
-    peak_memory_mb: float = math.nan
+    peak_memory_mb: float = math.nan  # peak resident memory so far, MB
     psnr_changed: Mapping[str, float] = field(default_factory=dict)
-    open_gates: tuple[int, ...] = ()
+    open_gates: tuple[int, ...] = ()  # after each epoch of the frame
 
     @property
     def is_key(self) -> bool:

@@ -24,49 +24,36 @@ from gsstream.packet.tables import coded_tables
 
 @dataclass(frozen=True, slots=True)
 class PacketStats:
-    """One packet. Sizes in bytes.
-
-    Arguments:
-        kind: key, delta or empty.
-        size: all bytes of the packet. sections: section -> bytes; ``header`` holds all headers.
-        changed_gaussians: rows with a residual that is not zero; all of them in a key packet.
-        sent_gaussians, open_gates: rows behind open gates, and these gates; all of them in a key packet.
-        coded: bytes of the entropy-coded sections, the tables of their models included.
-        entropy: empirical entropy of their symbols, each channel by itself or all together as they were modelled, and
-            the bits sent plainly. coded / entropy is the coder's efficiency.
-        float16_zstd: the same rows of the attributes that change, as float16 by zstandard level 19 (rows not named).
-        paper: the estimate of the S2GS paper (see :func:`paper_estimate`); no stream that can be decoded is that small.
-        decode_ms: wall time of decoding and updating the state, milliseconds.
-    """
+    """One packet. Sizes in bytes."""
 
     frame: int
-    kind: str
-    size: int
-    sections: dict[str, int]
-    changed_gaussians: int
+    kind: str  # key, delta or empty
+    size: int  # all bytes of the packet
+    sections: dict[str, int]  # section -> bytes; ``header`` holds all headers
+    changed_gaussians: int  # rows with a residual that is not zero; all of them in a key packet
+    #: sent_gaussians, open_gates: rows behind open gates, and these gates; all of them in a key packet.
     sent_gaussians: int
     open_gates: int
-    coded: int
+    coded: int  # bytes of the entropy-coded sections, the tables of their models included
+    #: Empirical entropy of their symbols, each channel by itself or all together as they were modelled, and the bits
+    #: sent plainly. coded / entropy is the coder's efficiency.
     entropy: float
-    float16_zstd: int
+    float16_zstd: int  # the same rows of the attributes that change, as float16 by zstandard level 19 (rows not named)
+    #: The estimate of the S2GS paper (see :func:`paper_estimate`); no stream that can be decoded is that small.
     paper: float
-    decode_ms: float
+    decode_ms: float  # wall time of decoding and updating the state, milliseconds
 
 
 @dataclass(frozen=True, slots=True)
 class StreamStats:
-    """All packets of a stream.
-
-    Arguments:
-        num_gaussians, num_nodes: of the last key packet. raw_key_bytes: its attributes as float32.
-        fps: pictures per second of the recording.
-    """
+    """All packets of a stream."""
 
     packets: tuple[PacketStats, ...]
+    #: num_gaussians, num_nodes: of the last key packet.
     num_gaussians: int
     num_nodes: int
-    raw_key_bytes: int
-    fps: float
+    raw_key_bytes: int  # its attributes as float32
+    fps: float  # pictures per second of the recording
 
     def of(self, *kinds: str) -> list[PacketStats]:
         """Return the packets of these kinds."""

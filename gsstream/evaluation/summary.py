@@ -12,37 +12,26 @@ from gsstream.metrics import slope_per_100
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Definitions: frame 0 apart from the rest; per frame the mean over cameras, then the mean over frames 1..T-1.
+    """Definitions: frame 0 apart from the rest; per frame the mean over cameras, then the mean over frames 1..T-1."""
 
-    Arguments:
-        frames: number of frames T.
-        psnr_first, psnr: dB, frame 0 and the mean of later frames. psnr_slope: dB per 100 frames.
-        ssim: mean of later frames. psnr_moving: dB on moving pixels, mean of later frames where something moves.
-        psnr_changed: the same on changed pixels, the bodies without shadows and rims.
-        kb_per_frame: bytes of delta and empty packets over their number, 1 KB = 1,000 bytes.
-        key_kb: bytes of the first key packet. kb_amortised: all bytes over all frames.
-        seconds_first, seconds: frame 0 and the mean of later frames.
-        sent: share of Gaussians behind open gates, mean of later frames; gates: share of open gates.
-        gates_per_sent: open gates for each Gaussian that is sent, mean of later frames that send any.
-        peak_memory_mb: largest of all frames.
-    """
-
-    frames: int
+    frames: int  # number of frames T
+    #: psnr_first, psnr: dB, frame 0 and the mean of later frames.
     psnr_first: float
     psnr: float
-    psnr_slope: float
-    ssim: float
-    psnr_moving: float
-    kb_per_frame: float
-    key_kb: float
-    kb_amortised: float
+    psnr_slope: float  # dB per 100 frames
+    ssim: float  # mean of later frames
+    psnr_moving: float  # dB on moving pixels, mean of later frames where something moves
+    kb_per_frame: float  # bytes of delta and empty packets over their number, 1 KB = 1,000 bytes
+    key_kb: float  # bytes of the first key packet
+    kb_amortised: float  # all bytes over all frames
+    #: seconds_first, seconds: frame 0 and the mean of later frames.
     seconds_first: float
     seconds: float
-    sent: float
+    sent: float  # share of Gaussians behind open gates, mean of later frames; gates: share of open gates
     gates: float
-    gates_per_sent: float
-    peak_memory_mb: float
-    psnr_changed: float = math.nan
+    gates_per_sent: float  # open gates for each Gaussian that is sent, mean of later frames that send any
+    peak_memory_mb: float  # largest of all frames
+    psnr_changed: float = math.nan  # the same on changed pixels, the bodies without shadows and rims
 
 
 def summarise(records: Sequence[FrameRecord]) -> Summary:

@@ -33,24 +33,17 @@ _CUT, _TIE = 1.0, 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """Limits of viewpoints around a point.
+    """Limits of viewpoints around a point."""
 
-    Arguments:
-        focus: [3] the point nearest to all optical axes.
-        up: [3] unit vector.
-        outward: whether cameras look away from the focus; then angles are those of where they look, else those of
-            where they stand.
-        azimuth: the middle of its range and half of it, radians (:meth:`angles`); None: all around.
-        elevation: lowest and highest, radians.
-        distance: smallest and largest from the focus, scene units.
-    """
-
-    focus: FloatArray
-    up: FloatArray
+    focus: FloatArray  # [3] the point nearest to all optical axes
+    up: FloatArray  # [3] unit vector
+    #: Whether cameras look away from the focus; then angles are those of where they look, else those of where they
+    #: stand.
     outward: bool
+    #: The middle of its range and half of it, radians (:meth:`angles`); None: all around.
     azimuth: tuple[float, float] | None
-    elevation: tuple[float, float]
-    distance: tuple[float, float]
+    elevation: tuple[float, float]  # lowest and highest, radians
+    distance: tuple[float, float]  # smallest and largest from the focus, scene units
 
     def arms(self, rig: Cameras) -> FloatArray:
         """[C, 3] unit vectors of which the angles are checked."""

@@ -42,24 +42,16 @@ class PluginFault(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Discovered:
-    """One plugin: healthy, left out, or in quarantine; exactly one of ``specs`` and ``error`` is given.
+    """One plugin: healthy, left out, or in quarantine; exactly one of ``specs`` and ``error`` is given."""
 
-    Arguments:
-        name: name of the entry point.
-        distribution, version: the installed distribution that ships it; "?" when its metadata is unreadable.
-        specs: what it declares, in its order.
-        error: why it is in quarantine.
-        declared: what a quarantined plugin did declare before it was refused, if it came that far.
-        left_out: not loaded, because GSSTREAM_LOAD_PLUGINS does not name it; ``specs`` is empty.
-    """
-
-    name: str
+    name: str  # name of the entry point
+    #: distribution, version: the installed distribution that ships it; "?" when its metadata is unreadable.
     distribution: str
     version: str
-    specs: tuple[Spec, ...] | None
-    error: BaseException | None = None
-    declared: tuple[Spec, ...] = ()
-    left_out: bool = False
+    specs: tuple[Spec, ...] | None  # what it declares, in its order
+    error: BaseException | None = None  # why it is in quarantine
+    declared: tuple[Spec, ...] = ()  # what a quarantined plugin did declare before it was refused, if it came that far
+    left_out: bool = False  # not loaded, because GSSTREAM_LOAD_PLUGINS does not name it; ``specs`` is empty
 
     @property
     def reason(self) -> str:

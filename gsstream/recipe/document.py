@@ -31,15 +31,10 @@ _NESTING = {"[": 1, "{": 1, "]": -1, "}": -1}
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where a value comes from.
+    """Where a value comes from."""
 
-    Arguments:
-        label: provenance, as printed beside the value: "default", "method s2gs", "file run.yaml:6", "command line".
-        where: prefix of error messages: "run.yaml:6:5", "--set gate.temperature=0.3".
-    """
-
-    label: str
-    where: str
+    label: str  # provenance, as printed beside the value: "default", "method s2gs", "file run.yaml:6", "command line"
+    where: str  # prefix of error messages: "run.yaml:6:5", "--set gate.temperature=0.3"
 
 
 DEFAULT = Origin("default", "default")
@@ -63,17 +58,12 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """The leaves of one file or of the command line, in the order they were written.
+    """The leaves of one file or of the command line, in the order they were written."""
 
-    Arguments:
-        leaves: path -> leaf.
-        marks: path -> origin of every key, those of sections too, where the place is known.
-        shorthand: whether ``gate.temperature`` may stand for ``gate.params.temperature``.
-    """
-
-    leaves: Mapping[KeyPath, Leaf]
+    leaves: Mapping[KeyPath, Leaf]  # path -> leaf
+    #: Path -> origin of every key, those of sections too, where the place is known.
     marks: Mapping[KeyPath, Origin] = field(default_factory=dict)
-    shorthand: bool = False
+    shorthand: bool = False  # whether ``gate.temperature`` may stand for ``gate.params.temperature``
 
     def where(self, path: KeyPath, leaf: Leaf) -> str:
         """Place of the key at ``path``, one of the keys that lead to ``leaf``."""

@@ -21,40 +21,26 @@ Outputs = dict[str, torch.Tensor]
 
 @dataclass(frozen=True)
 class Poison:
-    """Something that a part may read and in which a value is put, in place.
+    """Something that a part may read and in which a value is put, in place."""
 
-    Arguments:
-        what: it is, for the message.
-        named: what a refusal of it must name.
-        put: a value into a world.
-        usual: two values that it may have; where they make no difference to a part, it is not read.
-    """
-
-    what: str
-    named: str
-    put: Callable[[World, float], None]
+    what: str  # it is, for the message
+    named: str  # what a refusal of it must name
+    put: Callable[[World, float], None]  # a value into a world
+    #: Two values that it may have; where they make no difference to a part, it is not read.
     usual: tuple[float, float] = (0.75, 0.25)
 
 
 @dataclass(frozen=True)
 class Behaviour:
-    """How the common checks treat a kind; each kind with ``PartKind.behaviour`` has one in its room.
+    """How the common checks treat a kind; each kind with ``PartKind.behaviour`` has one in its room."""
 
-    Arguments:
-        outputs: every output of every method on a world, tensor by tensor.
-        poisons: what a part may read, one value of each.
-        keeps_precision: outputs have the precision of the logits given; otherwise they are float32.
-        by_gaussian: outputs have a row per Gaussian, which moves with it.
-        no_order: outputs whose names begin so are not compared after a permutation: the kind has a check of its own.
-        hands_on: may hand on a value that is not finite, because it shows in the loss.
-    """
-
-    outputs: Callable[[Any, World], Outputs]
-    poisons: tuple[Poison, ...]
-    keeps_precision: bool = True
-    by_gaussian: bool = False
+    outputs: Callable[[Any, World], Outputs]  # every output of every method on a world, tensor by tensor
+    poisons: tuple[Poison, ...]  # what a part may read, one value of each
+    keeps_precision: bool = True  # outputs have the precision of the logits given; otherwise they are float32
+    by_gaussian: bool = False  # outputs have a row per Gaussian, which moves with it
+    #: Outputs whose names begin so are not compared after a permutation: the kind has a check of its own.
     no_order: str | None = None
-    hands_on: bool = False
+    hands_on: bool = False  # may hand on a value that is not finite, because it shows in the loss
 
 
 def behaviour_of(part: Part) -> Behaviour:

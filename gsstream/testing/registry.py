@@ -26,21 +26,13 @@ class Advice(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One property.
+    """One property."""
 
-    Arguments:
-        name: name of the function; stable, because expected failures are given by it.
-        kind: "common", a kind of part, "source", "method", "packet" or "command".
-        kinds: kinds of part it is made on.
-        trait: the claim (a field of the kind's ``Traits``) that calls for it; None: every part of these kinds.
-        function: raises AssertionError with numbers.
-    """
-
-    name: str
-    kind: str
-    kinds: tuple[str, ...]
-    trait: str | None
-    function: Callable[..., None]
+    name: str  # name of the function; stable, because expected failures are given by it
+    kind: str  # "common", a kind of part, "source", "method", "packet" or "command"
+    kinds: tuple[str, ...]  # kinds of part it is made on
+    trait: str | None  # the claim (a field of the kind's ``Traits``) that calls for it; None: every part of these kinds
+    function: Callable[..., None]  # raises AssertionError with numbers
 
     @property
     def meaning(self) -> str:

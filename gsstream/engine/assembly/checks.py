@@ -52,16 +52,13 @@ def requested_checks(given: str | None = None) -> Checks:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Looks at what one part returned.
+    """Looks at what one part returned."""
 
-    Arguments:
-        level: how closely. slot, part: whose it is. where: the frame and iteration that an error names.
-    """
-
-    level: Checks
+    level: Checks  # how closely
+    #: slot, part: whose it is.
     slot: str
     part: object
-    where: Where
+    where: Where  # the frame and iteration that an error names
 
     def output(
         self, what: str, value: object, shape: tuple[int, ...], limits: tuple[float, float] | None = None

@@ -43,30 +43,24 @@ MAX_THRESHOLD, FIRST_THRESHOLD = 4.0, 3.0
 
 @dataclass(frozen=True, slots=True)
 class Past:
-    """The cost of one earlier frame that was optimised.
-
-    Arguments:
-        epochs: passes made. candidates: Gaussians that took part.
-        before, optimise, after: seconds of the frame until its passes begin, of the passes, and of what follows them.
-        weight, step_scale, threshold: what it was made with; the weight as in the last half of the passes.
-        parts: seconds of motion and growth. part_scale: share of their passes that they made.
-        estimate: bytes expected after the last pass; 0: not estimated. untrimmed: bytes before trimming. size: bytes.
-    """
+    """The cost of one earlier frame that was optimised."""
 
     frame: int
-    epochs: float
-    candidates: int
+    epochs: float  # passes made
+    candidates: int  # Gaussians that took part
+    #: before, optimise, after: seconds of the frame until its passes begin, of the passes, and of what follows them.
     before: float
     optimise: float
     after: float
+    #: weight, step_scale, threshold: what it was made with; the weight as in the last half of the passes.
     weight: float
     step_scale: float
     threshold: float
-    estimate: float
-    untrimmed: int
-    size: int
-    parts: float = 0.0
-    part_scale: float = 1.0
+    estimate: float  # bytes expected after the last pass; 0: not estimated
+    untrimmed: int  # bytes before trimming
+    size: int  # bytes
+    parts: float = 0.0  # seconds of motion and growth
+    part_scale: float = 1.0  # share of their passes that they made
 
 
 def read_past_frame(metrics: Mapping[str, Any]) -> Past | None:
@@ -88,33 +82,23 @@ def read_past_frame(metrics: Mapping[str, Any]) -> Past | None:
 
 @dataclass(frozen=True, slots=True)
 class FramePlan:
-    """The settings with which the next frame is made, and what it is expected to cost.
+    """The settings with which the next frame is made, and what it is expected to cost."""
 
-    Arguments:
-        epochs: passes over the cameras; with a time budget a prediction, corrected after every pass.
-        rd_lambda: at the start; moved after every pass where a size is to be met.
-        max_epochs: passes that are not exceeded however much time is left.
-        step_scale: factor on all quantisation steps, >= 1.
-        part_scale: share of their usual passes that motion and growth make, in a frame without a residual.
-        max_bytes: the size that must not be exceeded, or None. correction: real bytes per estimated byte.
-        seconds: what may be planned with from the start of the frame, or None.
-        after: seconds of it to keep for what follows the passes; None: unknown, the frame's own passes will tell.
-        each, candidates: seconds that a pass has taken, with so many Gaussians; None while nothing is known.
-        predicted_seconds, predicted_bytes: what the frame is expected to cost; None while nothing is known.
-    """
-
-    epochs: int
+    epochs: int  # passes over the cameras; with a time budget a prediction, corrected after every pass
     change_threshold: float
-    rd_lambda: float
-    max_epochs: int = 0
-    step_scale: float = 1.0
-    part_scale: float = 1.0
-    max_bytes: int | None = None
-    correction: float = 1.0
-    seconds: float | None = None
+    rd_lambda: float  # at the start; moved after every pass where a size is to be met
+    max_epochs: int = 0  # passes that are not exceeded however much time is left
+    step_scale: float = 1.0  # factor on all quantisation steps, >= 1
+    part_scale: float = 1.0  # share of their usual passes that motion and growth make, in a frame without a residual
+    max_bytes: int | None = None  # the size that must not be exceeded, or None
+    correction: float = 1.0  # real bytes per estimated byte
+    seconds: float | None = None  # what may be planned with from the start of the frame, or None
+    #: Seconds of it to keep for what follows the passes; None: unknown, the frame's own passes will tell.
     after: float | None = None
+    #: each, candidates: seconds that a pass has taken, with so many Gaussians; None while nothing is known.
     each: float | None = None
     candidates: int = 0
+    #: predicted_seconds, predicted_bytes: what the frame is expected to cost; None while nothing is known.
     predicted_seconds: float | None = None
     predicted_bytes: float | None = None
 

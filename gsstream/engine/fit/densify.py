@@ -42,19 +42,12 @@ class DensifyStatistics:
 
 @dataclass(frozen=True, slots=True)
 class GrowthLimits:
-    """Where a scene grows, and how far.
+    """Where a scene grows, and how far."""
 
-    Arguments:
-        gradient: mean screen gradient, in half image widths, above which a Gaussian is densified.
-        most: number of Gaussians that growth never exceeds.
-        extent: of the rig, scene units.
-        widest: standard deviation from which a Gaussian is oversized, scene units.
-    """
-
-    gradient: float
-    most: int
-    extent: float
-    widest: float
+    gradient: float  # mean screen gradient, in half image widths, above which a Gaussian is densified
+    most: int  # number of Gaussians that growth never exceeds
+    extent: float  # of the rig, scene units
+    widest: float  # standard deviation from which a Gaussian is oversized, scene units
 
 
 def grow_and_prune(

@@ -16,19 +16,12 @@ class Refinement:
     """All Gaussians of a scene in training, which no player has yet. Nothing in it is changed once it is made.
 
     It follows from the first key packet, the packets since and their pictures, so a resumed run makes it again.
-
-    Arguments:
-        gaussians: [B] rows, raw values.
-        levels: [B] int64 octree level of each.
-        ancestors: [B] int64 row of the players' scene that each came from; -1: that one is gone.
-        moments: attribute -> Adam state of its rows (``RowParameters.moments``); empty before the first iteration.
-        statistics: of the screen gradients since Gaussians were last added.
-        iterations: made so far.
     """
 
-    gaussians: Gaussians[torch.Tensor]
-    levels: torch.Tensor
-    ancestors: torch.Tensor
+    gaussians: Gaussians[torch.Tensor]  # [B] rows, raw values
+    levels: torch.Tensor  # [B] int64 octree level of each
+    ancestors: torch.Tensor  # [B] int64 row of the players' scene that each came from; -1: that one is gone
+    #: Attribute -> Adam state of its rows (``RowParameters.moments``); empty before the first iteration.
     moments: Mapping[str, Mapping[str, torch.Tensor]]
-    statistics: DensifyStatistics
-    iterations: int
+    statistics: DensifyStatistics  # of the screen gradients since Gaussians were last added
+    iterations: int  # made so far

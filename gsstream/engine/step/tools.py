@@ -30,32 +30,21 @@ def _not_resuming(index: int) -> Frame:
 
 @dataclass(frozen=True)
 class RunTools:
-    """What a run lends to its method.
+    """What a run lends to its method."""
 
-    Arguments:
-        parts: the live parts of the recipe.
-        rng: random streams by name and frame.
-        meta: makes what a key packet says about the run, from the frame that is to be sent.
-        points: makes the seeds of frame 0, from its training images.
-        log: the record of the frame.
-        first: frame 0 of another stream, to be taken over; or None.
-        progress: told about the iterations of frame 0.
-        budget: what the frame may spend; None: what the recipe says.
-        key_refusal: number of Gaussians -> why a key packet cannot be paid for now, or None.
-        replay: the states of players since the last key packet, while a stream is being resumed.
-        recorded: frame index -> its training images, while a stream is being resumed.
-    """
-
-    parts: Assembly
-    rng: Rng
-    meta: Callable[[Frame], StreamMeta]
-    points: Callable[[Frame], PointCloud]
-    log: FrameLog = field(default_factory=FrameLog)
-    first: PlayerState | None = None
-    progress: Progress = lambda *_: None
-    budget: Allowance | None = None
+    parts: Assembly  # the live parts of the recipe
+    rng: Rng  # random streams by name and frame
+    meta: Callable[[Frame], StreamMeta]  # makes what a key packet says about the run, from the frame that is to be sent
+    points: Callable[[Frame], PointCloud]  # makes the seeds of frame 0, from its training images
+    log: FrameLog = field(default_factory=FrameLog)  # the record of the frame
+    first: PlayerState | None = None  # frame 0 of another stream, to be taken over; or None
+    progress: Progress = lambda *_: None  # told about the iterations of frame 0
+    budget: Allowance | None = None  # what the frame may spend; None: what the recipe says
+    #: Number of Gaussians -> why a key packet cannot be paid for now, or None.
     key_refusal: Callable[[int], str | None] = lambda _: None
+    #: The states of players since the last key packet, while a stream is being resumed.
     replay: Callable[[], Iterator[PlayerState]] = lambda: iter(())
+    #: Frame index -> its training images, while a stream is being resumed.
     recorded: Callable[[int], Frame] = _not_resuming
 
     @property

@@ -37,28 +37,18 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class PrepareOptions:
-    """How a scene is made.
+    """How a scene is made."""
 
-    Arguments:
-        test: ids of test cameras; None: those of a given calibration.
-        model: lens model of structure from motion (a key of ``init.mapping.LENSES``).
-        each: every camera has a lens of its own; else all share one where all pictures have one size.
-        frames: at most so many frames; None: all.
-        width: pictures are shrunk to this width; None: that of the smallest camera. Pictures of other shapes are
-            shrunk evenly and cut around their middle.
-        max_points: points kept.
-        max_error: points with a larger mean reprojection error are dropped, pixels.
-        fps: frames per second of the recording, when it is not given elsewhere.
-    """
-
-    test: tuple[str, ...] | None = None
-    model: str = "SIMPLE_RADIAL"
-    each: bool = False
-    frames: int | None = None
+    test: tuple[str, ...] | None = None  # ids of test cameras; None: those of a given calibration
+    model: str = "SIMPLE_RADIAL"  # lens model of structure from motion (a key of ``init.mapping.LENSES``)
+    each: bool = False  # every camera has a lens of its own; else all share one where all pictures have one size
+    frames: int | None = None  # at most so many frames; None: all
+    #: Pictures are shrunk to this width; None: that of the smallest camera. Pictures of other shapes are shrunk
+    #: evenly and cut around their middle.
     width: int | None = None
-    max_points: int = 50_000
-    max_error: float = 2.0
-    fps: float = 30.0
+    max_points: int = 50_000  # points kept
+    max_error: float = 2.0  # points with a larger mean reprojection error are dropped, pixels
+    fps: float = 30.0  # frames per second of the recording, when it is not given elsewhere
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,19 +22,12 @@ VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".ts")
 
 @dataclass(frozen=True, slots=True)
 class RawCamera:
-    """One camera: its pictures in order, its video, or what the reader of a layout made of them.
+    """One camera: its pictures in order, its video, or what the reader of a layout made of them."""
 
-    Arguments:
-        name: its id.
-        files: pictures in order, or one video; none where there is a clip.
-        size: (width, height) of frame 0.
-        clip: the pictures as a reader found them, of which those of ``span`` are taken.
-    """
-
-    name: str
-    files: tuple[Path, ...]
-    size: tuple[int, int]
-    clip: Clip | None = None
+    name: str  # its id
+    files: tuple[Path, ...]  # pictures in order, or one video; none where there is a clip
+    size: tuple[int, int]  # (width, height) of frame 0
+    clip: Clip | None = None  # the pictures as a reader found them, of which those of ``span`` are taken
     span: range = range(0)
 
     @property

@@ -18,17 +18,12 @@ ZOOMS = np.geomspace(0.7, 3.0, 60)
 
 @dataclass(frozen=True, slots=True)
 class Undistortion:
-    """How pinhole pictures are made of raw ones.
+    """How pinhole pictures are made of raw ones."""
 
-    Arguments:
-        K: [3, 3] of the pinhole pictures.
-        places: [factor H, factor W, 2] where each sample lies in the raw picture, pixels.
-        factor: samples per pixel and axis. A pixel is the mean of its samples; one alone would skip raw pixels, which
-            flickers, where pictures are shrunk.
-    """
-
-    K: FloatArray
-    places: FloatArray
+    K: FloatArray  # [3, 3] of the pinhole pictures
+    places: FloatArray  # [factor H, factor W, 2] where each sample lies in the raw picture, pixels
+    #: Samples per pixel and axis. A pixel is the mean of its samples; one alone would skip raw pixels, which
+    #: flickers, where pictures are shrunk.
     factor: int = 1
 
     def apply(self, image: FloatArray) -> FloatArray:

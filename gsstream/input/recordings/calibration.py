@@ -28,25 +28,19 @@ CALIBRATION_FILE = "cameras.json"
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What cameras.json says.
-
-    Arguments:
-        num_frames: 0 where a growing recording, or one of videos alone, does not say.
-        train, test: as declared; of the size of the first camera where sizes differ.
-        patterns: camera id -> path of its video, or pattern of the paths of its images, relative to the folder.
-        lenses: camera id -> its distortion, where it has any.
-        sizes: camera id -> (width, height).
-    """
+    """What cameras.json says."""
 
     name: str
     fps: float
-    num_frames: int
+    num_frames: int  # 0 where a growing recording, or one of videos alone, does not say
     licence: str
+    #: train, test: as declared; of the size of the first camera where sizes differ.
     train: Cameras
     test: Cameras
+    #: Camera id -> path of its video, or pattern of the paths of its images, relative to the folder.
     patterns: dict[str, str]
-    lenses: dict[str, Lens]
-    sizes: dict[str, tuple[int, int]]
+    lenses: dict[str, Lens]  # camera id -> its distortion, where it has any
+    sizes: dict[str, tuple[int, int]]  # camera id -> (width, height)
 
     @property
     def is_raw(self) -> bool:

@@ -17,17 +17,12 @@ _WIDEST, _NARROWEST = 0.25, 2.0
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """How a camera bends rays, on coordinates x / z, y / z.
+    """How a camera bends rays, on coordinates x / z, y / z."""
 
-    Arguments:
-        kind: "radial": Brown-Conrady, as OpenCV's pinhole model; "fisheye": equidistant, as OpenCV's fisheye model.
-        k: radial coefficients k1, k2, ...; of "radial", k4 to k6 divide (OpenCV's rational model).
-        p: tangential coefficients p1, p2 ("radial" only).
-    """
-
+    #: "radial": Brown-Conrady, as OpenCV's pinhole model; "fisheye": equidistant, as OpenCV's fisheye model.
     kind: Literal["radial", "fisheye"]
-    k: tuple[float, ...]
-    p: tuple[float, float] = (0.0, 0.0)
+    k: tuple[float, ...]  # radial coefficients k1, k2, ...; of "radial", k4 to k6 divide (OpenCV's rational model)
+    p: tuple[float, float] = (0.0, 0.0)  # tangential coefficients p1, p2 ("radial" only)
 
     @property
     def is_identity(self) -> bool:

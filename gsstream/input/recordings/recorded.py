@@ -31,32 +31,20 @@ class SeenPoints:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """What a reader found on disk.
+    """What a reader found on disk."""
 
-    Arguments:
-        name: short name.
-        where: the calibration file, for messages.
-        rig: all cameras, world-to-camera, OpenCV axes, corner origin; ``Ks`` are those of the images as stored.
-        clips: camera id -> its pictures, in the order of the rig.
-        test: ids of the test cameras, which never train.
-        fps: frames per second; videos know better.
-        lenses: camera id -> distortion, where there is any.
-        sizes: camera id -> (width, height) of its pictures; empty: all have those of the rig.
-        points: reads points of frame 0; None when none ship.
-        folder: the recording's, in which it may keep what else is known of frame 0.
-    """
-
-    name: str
-    where: str
-    rig: Cameras
-    clips: Mapping[str, Clip]
-    test: tuple[str, ...] = ()
-    fps: float = 30.0
-    lenses: Mapping[str, Lens] = field(default_factory=dict)
+    name: str  # short name
+    where: str  # the calibration file, for messages
+    rig: Cameras  # all cameras, world-to-camera, OpenCV axes, corner origin; ``Ks`` are those of the images as stored
+    clips: Mapping[str, Clip]  # camera id -> its pictures, in the order of the rig
+    test: tuple[str, ...] = ()  # ids of the test cameras, which never train
+    fps: float = 30.0  # frames per second; videos know better
+    lenses: Mapping[str, Lens] = field(default_factory=dict)  # camera id -> distortion, where there is any
+    #: Camera id -> (width, height) of its pictures; empty: all have those of the rig.
     sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
-    points: Callable[[], SeenPoints | None] = lambda: None
+    points: Callable[[], SeenPoints | None] = lambda: None  # reads points of frame 0; None when none ship
     licence: str = ""
-    folder: Path | None = None
+    folder: Path | None = None  # the recording's, in which it may keep what else is known of frame 0
 
 
 class RecordedSource:

@@ -20,17 +20,12 @@ class RecordingWarning(UserWarning):
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """How clips are laid beside each other.
+    """How clips are laid beside each other."""
 
-    Arguments:
-        num_frames: instants that all clips have.
-        skip: camera -> pictures left out at its beginning, so that equal numbers stand beside each other.
-        fps: of the videos; None when all clips are images.
-    """
-
-    num_frames: int
+    num_frames: int  # instants that all clips have
+    #: Camera -> pictures left out at its beginning, so that equal numbers stand beside each other.
     skip: Mapping[str, int]
-    fps: float | None
+    fps: float | None  # of the videos; None when all clips are images
 
 
 def align(name: str, clips: Mapping[str, Clip]) -> Alignment:

@@ -26,19 +26,12 @@ _ON_PATHS = ("paths", "stop", "reversal", "flash")
 
 @dataclass(frozen=True, slots=True)
 class ToyScene:
-    """What stands, and what moves at which frame.
+    """What stands, and what moves at which frame."""
 
-    Arguments:
-        name: of the scene.
-        seed: of textures and of the starting phase.
-        motion: speed; 0: nothing moves.
-        event: the frame E at which it happens.
-    """
-
-    name: SceneName
-    seed: int
-    motion: float
-    event: int
+    name: SceneName  # of the scene
+    seed: int  # of textures and of the starting phase
+    motion: float  # speed; 0: nothing moves
+    event: int  # the frame E at which it happens
 
     def static(self) -> list[Placed]:
         """Return the room (first) and what never moves."""

@@ -15,17 +15,11 @@ from gsstream.parts.render.wrt import WrtTransforms
 
 
 class Damping(NamedTuple):
-    """Levenberg-Marquardt damping, which shortens steps where the curvature is small.
+    """Levenberg-Marquardt damping, which shortens steps where the curvature is small."""
 
-    Arguments:
-        relative: share of the group's mean curvature, or of the mean over all groups if larger, on the diagonal.
-        absolute: curvature added to the diagonal besides: summed over the values of an image, per pixel^2.
-        max_step: largest change of any of the six numbers in one step, pixels.
-    """
-
-    relative: float
-    absolute: float
-    max_step: float
+    relative: float  # share of the group's mean curvature, or of the mean over all groups if larger, on the diagonal
+    absolute: float  # curvature added to the diagonal besides: summed over the values of an image, per pixel^2
+    max_step: float  # largest change of any of the six numbers in one step, pixels
 
 
 class DampedNewton:

@@ -18,21 +18,14 @@ BORDER = 0.03
 
 @dataclass(frozen=True, slots=True)
 class RigCamera:
-    """Pose and lens.
+    """Pose and lens."""
 
-    Arguments:
-        name: in the calibration; that of the pictures may differ.
-        w2c: [4, 4] world to camera, OpenCV axes.
-        K: [3, 3] pixels, corner origin; without a size: in units of the longer side, from the middle of the picture.
-        lens: how rays bend.
-        size: (width, height) that K is for; None: not stored.
-    """
-
-    name: str
-    w2c: FloatArray
+    name: str  # in the calibration; that of the pictures may differ
+    w2c: FloatArray  # [4, 4] world to camera, OpenCV axes
+    #: [3, 3] pixels, corner origin; without a size: in units of the longer side, from the middle of the picture.
     K: FloatArray
-    lens: Lens
-    size: tuple[int, int] | None
+    lens: Lens  # how rays bend
+    size: tuple[int, int] | None  # (width, height) that K is for; None: not stored
 
     def intrinsics(self, size: tuple[int, int]) -> FloatArray:
         """Return K for pictures of this size. Raises SourceError when they show another part of the view."""

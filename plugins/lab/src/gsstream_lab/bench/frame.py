@@ -55,24 +55,18 @@ DENSE = {"confidence": "uniform", "propagation": "group-max", "gate": "always-op
 
 @dataclass(frozen=True)
 class FramePlan:
-    """What is measured.
+    """What is measured."""
 
-    Arguments:
-        recipe: what :func:`variants` are made of. shares: of tiles that change, [0, 1], at ``static[0]`` Gaussians.
-        static: Gaussians of the part that stands still; at every size the object alone moves in one case.
-        moving: Gaussians of the object. shift: how far everything moving moves, in pixels.
-    """
-
-    recipe: Recipe
-    shares: tuple[float, ...]
-    static: tuple[int, ...]
-    moving: int
+    recipe: Recipe  # what :func:`variants` are made of
+    shares: tuple[float, ...]  # of tiles that change, [0, 1], at ``static[0]`` Gaussians
+    static: tuple[int, ...]  # Gaussians of the part that stands still; at every size the object alone moves in one case
+    moving: int  # Gaussians of the object
     views: int
     width: int
     height: int
     repetitions: int
     warm_up: int
-    shift: float = 1.0
+    shift: float = 1.0  # how far everything moving moves, in pixels
     seed: int = 0
 
 

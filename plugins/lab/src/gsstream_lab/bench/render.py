@@ -50,18 +50,13 @@ class Size:
 
 @dataclass(frozen=True)
 class RenderPlan:
-    """What is measured.
-
-    Arguments:
-        shares: of tiles that are drawn, (0, 1].
-        renderers: names of renderer parts.
-        repetitions, warm_up: rounds that count, and rounds before them.
-    """
+    """What is measured."""
 
     sizes: tuple[Size, ...]
-    shares: tuple[float, ...]
+    shares: tuple[float, ...]  # of tiles that are drawn, (0, 1]
     threads: tuple[int, ...]
-    renderers: tuple[str, ...]
+    renderers: tuple[str, ...]  # names of renderer parts
+    #: repetitions, warm_up: rounds that count, and rounds before them.
     repetitions: int
     warm_up: int
     seed: int = 0

@@ -37,20 +37,15 @@ class Peak:
 
 @dataclass(frozen=True, slots=True)
 class Footprints:
-    """Where the Gaussians of a scene lie in one image.
+    """Where the Gaussians of a scene lie in one image."""
 
-    Arguments:
-        means2d: [N, 2] pixels. half: [N, 2] half sides of the box around alpha >= 1/255.
-        conics: [N, 3] upper triangle of the inverse covariance. depths, opacities: [N].
-        visible: [N] bool, in front of the camera and the box meets the image.
-    """
-
-    means2d: FloatArray
-    half: FloatArray
-    conics: FloatArray
+    means2d: FloatArray  # [N, 2] pixels
+    half: FloatArray  # [N, 2] half sides of the box around alpha >= 1/255
+    conics: FloatArray  # [N, 3] upper triangle of the inverse covariance
+    #: depths, opacities: [N].
     depths: FloatArray
     opacities: FloatArray
-    visible: BoolArray
+    visible: BoolArray  # [N] bool, in front of the camera and the box meets the image
     width: int
     height: int
 

@@ -40,17 +40,11 @@ def fresh_recipe(recipe: Recipe, epochs: int | None = None) -> Recipe:
 
 @dataclass(frozen=True)
 class FreshFrames:
-    """The fresh reconstructions of one recording by one recipe, one stream file of a single packet for each frame.
+    """The fresh reconstructions of one recording by one recipe, one stream file of a single packet for each frame."""
 
-    Arguments:
-        parts: assembled from :func:`fresh_recipe`.
-        source: the recording as the run opened it.
-        cache: folder that keeps them; several runs may share one, because a file's name says what it was made of.
-    """
-
-    parts: Assembly
-    source: FrameSource
-    cache: Path
+    parts: Assembly  # assembled from :func:`fresh_recipe`
+    source: FrameSource  # the recording as the run opened it
+    cache: Path  # folder that keeps them; several runs may share one, because a file's name says what it was made of
 
     @classmethod
     def of_run(

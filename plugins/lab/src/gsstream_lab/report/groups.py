@@ -29,18 +29,14 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """All finished seeds of a point.
+    """All finished seeds of a point."""
 
-    Arguments:
-        scene, variant, axes: of the point.
-        runs: one for each seed.
-        words: key of an axis -> the word for it in labels; for others the last word of the key.
-    """
-
+    #: scene, variant, axes: of the point.
     scene: str
     variant: str
     axes: Mapping[str, Any]
-    runs: tuple[Run, ...]
+    runs: tuple[Run, ...]  # one for each seed
+    #: Key of an axis -> the word for it in labels; for others the last word of the key.
     words: Mapping[str, str] = field(default_factory=dict)
 
     @property

@@ -16,18 +16,13 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """A number of a run.
+    """A number of a run."""
 
-    Arguments:
-        key: name in the table of the paper, too. title: with its unit. form: how it is printed.
-        higher: whether more is better; None: neither.
-        value: (summary, frames after the first as written, cell record) -> number, nan where it was not measured.
-    """
-
-    key: str
-    title: str
-    form: str
-    higher: bool | None
+    key: str  # name in the table of the paper, too
+    title: str  # with its unit
+    form: str  # how it is printed
+    higher: bool | None  # whether more is better; None: neither
+    #: (summary, frames after the first as written, cell record) -> number, nan where it was not measured.
     value: Callable[[Summary, Sequence[Row], Row], float]
 
 

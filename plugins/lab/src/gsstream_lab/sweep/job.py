@@ -30,45 +30,32 @@ _FPS_WARM_UP, _FPS_RENDERS = 5, 30
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What a worker is sent.
+    """What a worker is sent."""
 
-    Arguments:
-        id: of the cell or frame 0.
-        uri: the recording, as this worker opens it.
-        first_frame: bytes of a stream whose frame 0 is taken over, or None.
-        measure: what to measure; None for a frame 0 that is only to be shared.
-        work: folder for temporary files, or None for the system's.
-        alone: whether no other cell runs beside it, so that the machine's energy is its own.
-    """
-
-    id: str
-    uri: str
+    id: str  # of the cell or frame 0
+    uri: str  # the recording, as this worker opens it
     resolved: ResolvedRecipe
-    first_frame: bytes | None = None
-    measure: Measure | None = None
-    work: str | None = None
-    alone: bool = False
+    first_frame: bytes | None = None  # bytes of a stream whose frame 0 is taken over, or None
+    measure: Measure | None = None  # what to measure; None for a frame 0 that is only to be shared
+    work: str | None = None  # folder for temporary files, or None for the system's
+    alone: bool = False  # whether no other cell runs beside it, so that the machine's energy is its own
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a worker sends back.
-
-    Arguments:
-        frames: per frame: what the run wrote down, and what was measured on the decoded frame.
-        recipe: with every part's settings written out; ``recipe_hash`` of it.
-        stream: the bytes of the stream.
-        machine: facts that stay; ``run``: facts of this run (date, load, seconds, noise of cameras, pictures/second).
-        error, details: why there is nothing else, and the traceback.
-    """
+    """What a worker sends back."""
 
     id: str
+    #: Per frame: what the run wrote down, and what was measured on the decoded frame.
     frames: tuple[Mapping[str, Any], ...] = ()
+    #: With every part's settings written out; ``recipe_hash`` of it.
     recipe: Mapping[str, Any] = field(default_factory=dict)
     recipe_hash: str = ""
-    stream: bytes = b""
+    stream: bytes = b""  # the bytes of the stream
+    #: Facts that stay; ``run``: facts of this run (date, load, seconds, noise of cameras, pictures/second).
     machine: Mapping[str, Any] = field(default_factory=dict)
     run: Mapping[str, Any] = field(default_factory=dict)
+    #: error, details: why there is nothing else, and the traceback.
     error: str | None = None
     details: str = ""
 

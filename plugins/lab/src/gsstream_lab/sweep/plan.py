@@ -21,21 +21,15 @@ from gsstream_lab.sweep.rows import with_bases
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One run.
+    """One run."""
 
-    Arguments:
-        id: hash of everything that decides the run: equal ids are the same run.
-        first: id of the frame 0 it takes over; None: it makes its own.
-        axes: recipe key -> value where the cell differs from its variant.
-    """
-
-    id: str
+    id: str  # hash of everything that decides the run: equal ids are the same run
     scene: Scene
     variant: str
-    axes: Mapping[str, Any]
+    axes: Mapping[str, Any]  # recipe key -> value where the cell differs from its variant
     seed: int
     resolved: ResolvedRecipe
-    first: str | None
+    first: str | None  # id of the frame 0 it takes over; None: it makes its own
 
     @property
     def label(self) -> str:
@@ -61,17 +55,13 @@ class FirstFrameRun:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Everything a sweep will do.
-
-    Arguments:
-        points: all (scene, variant, axes, seed) in the order of the file; two points may be the same run, then they
-            are cells of the same id.
-        firsts: id -> frame 0.
-    """
+    """Everything a sweep will do."""
 
     config: SweepConfig
+    #: All (scene, variant, axes, seed) in the order of the file; two points may be the same run, then they are cells
+    #: of the same id.
     points: tuple[Cell, ...]
-    firsts: Mapping[str, FirstFrameRun]
+    firsts: Mapping[str, FirstFrameRun]  # id -> frame 0
 
     @property
     def cells(self) -> dict[str, Cell]:

@@ -32,22 +32,17 @@ TIE = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What a candidate did on the pilot's frames, the first left out.
-
-    Arguments:
-        psnr, moving: dB, means. sizes: bytes. seconds: by the budget's clock. memory: largest of all, bytes.
-        inside: frames inside every limit.
-        error: why there is nothing else.
-    """
+    """What a candidate did on the pilot's frames, the first left out."""
 
     name: str
+    #: psnr, moving: dB, means.
     psnr: float = math.nan
     moving: float = math.nan
-    sizes: tuple[int, ...] = ()
-    seconds: tuple[float, ...] = ()
-    memory: float = math.nan
-    inside: int = 0
-    error: str | None = None
+    sizes: tuple[int, ...] = ()  # bytes
+    seconds: tuple[float, ...] = ()  # by the budget's clock
+    memory: float = math.nan  # largest of all, bytes
+    inside: int = 0  # frames inside every limit
+    error: str | None = None  # why there is nothing else
 
     @property
     def frames(self) -> int:

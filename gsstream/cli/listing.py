@@ -23,12 +23,7 @@ def fitting(text: str) -> str:
 
 
 def printable(text: object, keep: str = "") -> str:
-    """Return a text in which everything is escaped that a terminal would obey.
-
-    Streams and recordings say what is printed.
-
-    ``keep``: characters left as they are although they are not printable, e.g. a line feed.
-    """
+    """Return a text with everything escaped that a terminal would obey, except the characters ``keep``."""
     return "".join(sign if sign.isprintable() or sign in keep else ascii(sign)[1:-1] for sign in str(text))
 
 

@@ -73,9 +73,7 @@ def overrides(
 ) -> list[tuple[str, str]]:
     """Return what a command line changes in a recipe: (option, KEY.PATH=VALUE), the short options last.
 
-    Arguments:
-        settings: of ``--set``. budget: of ``--budget``.
-        short: recipe key -> value of an option of that name; None: not given.
+    ``short``: recipe key -> value of an option of that name; None: not given.
     """
     from gsstream.recipe.budget import budget_overrides
 

@@ -168,11 +168,7 @@ def _what_there_is(
 def _pictures(
     result: RunResult, recording: FrameSource, wanted: Mapping[str, bool], quiet: bool, warned: bool
 ) -> None:
-    """Contact sheet, plots, summary and video of what was written, and where to find them.
-
-    ``wanted``: as ``write_gallery`` takes it. ``warned``: the run has said already that nothing fast renders here; the
-    player need not say it again.
-    """
+    """Contact sheet, plots, summary and video; ``warned``: the run has said that nothing fast renders here."""
     from gsstream.evaluation.gallery import SUMMARY, write_gallery
     from gsstream.player.render import SlowRendererWarning
 

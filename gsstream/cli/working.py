@@ -12,12 +12,7 @@ from gsstream.core.signs import Signs
 
 @contextmanager
 def working(what: str, quiet: bool = False) -> Iterator[Signs]:
-    """Show what is worked at; Ctrl-C, SIGTERM and SIGHUP end it at once, and temporary files go.
-
-    Arguments:
-        what: what to show until more is told.
-        quiet: show nothing.
-    """
+    """Show what is worked at; Ctrl-C, SIGTERM and SIGHUP end it at once, and temporary files go."""
     from gsstream.engine.run.output import ended_by_signals
 
     with ended_by_signals() as came, Signs(quiet) as signs:

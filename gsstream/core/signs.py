@@ -36,10 +36,6 @@ class Signs:
     """A bar with count and time left on a terminal; elsewhere a line every few seconds, as long as this is open.
 
     Work that ends before the first line is due prints nothing.
-
-    Arguments:
-        quiet: show nothing at all.
-        clock: seconds that only grow.
     """
 
     #: When others were closed last, and when they had printed last.

@@ -10,14 +10,7 @@ NEWER_RECIPE = "write its keys as 'gsstream recipe METHOD' shows them, and set s
 
 
 def version_problem(what: str, written: str, spoken: str, cure: str = NEWER_PLUGIN) -> str | None:
-    """Return why something written for another version cannot be used here; None when it can.
-
-    Arguments:
-        what: the noun of the sentence, e.g. ``"component API"``.
-        written: "major.minor" declared by the plugin or file.
-        spoken: "major.minor" of this gsstream.
-        cure: what helps where it is too old.
-    """
+    """Return why a ``what`` written for another "major.minor" cannot be used here, and ``cure``; None: it can."""
     match = re.fullmatch(r"(\d+)\.(\d+)", written)
     if match is None:
         return f"{what} version is {written!r}; expected 'major.minor', e.g. {spoken!r}"

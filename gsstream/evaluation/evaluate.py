@@ -105,11 +105,7 @@ class Evaluation:
         return json.dumps(data, indent=1, allow_nan=False)
 
     def table(self) -> str:
-        """Return a Markdown table of the decoded stream and of frame 0 held still.
-
-        Columns: frame 0, mean of later frames, slope, SSIM, moving and changed pixels, those and all that training
-        cameras see, LPIPS if measured.
-        """
+        """Return a Markdown table of the decoded stream and of frame 0 held still."""
         quality = {"ssim": "SSIM", "psnr_moving": "moving", "psnr_changed": "changed"}
         if any(math.isfinite(view.seen_share) for view in self.views):
             quality |= {"psnr_seen": "seen", "psnr_changed_seen": "changed, seen"}
@@ -203,12 +199,10 @@ def evaluate_frames(
     split: Literal["train", "test"] = "test", lpips: OnnxLpips | None = None,
     extras: Mapping[str, ViewMetric] | None = None, progress: Callable[[int, int], None] | None = None,
 ) -> Evaluation:  # fmt: skip
-    """Compare pictures of every test view with the recording.
+    """Compare pictures of every test view with the recording, clamped to [0, 1] as a screen would (3DGS).
 
-    Colours are clamped to [0, 1] first, as a screen would (3DGS convention). Noise is measured between the first two
-    evaluated frames; "moving" and "changed" are relative to the first evaluated frame, which is also the one held.
-
-    Raises InputError when the recording's cameras are not those of the pictures.
+    Noise is measured between the first two evaluated frames; the first is also the one that is held and that "moving"
+    and "changed" refer to. Raises InputError when the cameras are not those of the pictures.
     """
     rig, chosen = shown.rig, sorted(set(shown.frames if frames is None else frames))
     if not chosen or len(rig) == 0:

@@ -61,10 +61,9 @@ def finite_or_none(value: Any) -> Any:
 
 
 def read_records(path: str | os.PathLike[str]) -> list[FrameRecord]:
-    """Read ``metrics.jsonl`` (or the folder that holds it), in the order of frames; the last entry of a frame counts.
+    """Read ``metrics.jsonl`` (or its folder) in the order of frames; the last entry of a frame counts.
 
-    Unknown entries are passed over, so that a newer writer can be summarised. Raises InputError naming file and line
-    (``engine.run.metrics_log.read_metrics``), and when there is no frame.
+    Unknown entries are passed over. Raises InputError naming file and line, and when there is no frame.
     """
     path = Path(path)
     path = path / "metrics.jsonl" if path.is_dir() else path

@@ -146,9 +146,7 @@ def _changing(delta: Delta | None) -> int:
 
 
 def paper_estimate(state: PlayerState, kind: PacketKind) -> float:
-    """Return the bytes that the S2GS paper would report for this packet.
-
-    The size function of the released code was read and restated.
+    """Return the bytes that the S2GS paper would report for this packet, by the size function of its released code.
 
     Frame 0: every attribute but positions and view-dependent colour as float32, position offsets as float32, and the
     zero-order entropy of the view-dependent colour. Later: decoders as float32 in every frame, position offsets of

@@ -16,11 +16,9 @@ def flicker(
 ) -> float:
     """Return the mean absolute change of still pixels between two decoded frames, in levels of 8 bits.
 
-    Still are pixels whose ground truth does not differ between the two frames beyond the camera's noise (the rule of
-    ``moving_mask``, applied to consecutive frames). The recording's own noise is not part of it: only decoded pictures
-    are subtracted, so 0 means a perfectly calm picture, whether right or wrong.
-
-    Returns nan where everything moves. Raises ShapeError when shapes disagree.
+    Still are pixels whose ground truth does not differ between the frames beyond the camera's noise (as in
+    ``moving_mask``). Only decoded pictures are subtracted, so 0 means a calm picture, right or wrong; nan: everything
+    moves.
     """
     check_pair(image, last_image)
     check_pair(image, truth)

@@ -14,9 +14,7 @@ _PIXELS_PER_DEGREE = 67.0206
 
 
 def flip(image: FloatArray, target: FloatArray) -> float:
-    """Return the mean LDR-FLIP of two [H, W, 3] images in [0, 1], sRGB as recorded.
-
-    It is 0 for equal pictures and at most 1.
+    """Return the mean LDR-FLIP, 0 to 1, of two [H, W, 3] images in [0, 1], sRGB as recorded.
 
     Raises PluginUnavailable without the package flip-evaluator (extra: metrics), ShapeError when shapes disagree.
     """

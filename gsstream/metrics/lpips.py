@@ -28,19 +28,10 @@ RANGES = {
 class OnnxLpips:
     """A distance of two images, computed by an ONNX model on the CPU.
 
-    The model has two float32 inputs [1, 3, H, W] (image, then target; H and W may be dynamic) and one float32 output
-    of a single element. The constants inside LPIPS assume [-1, 1]; splatting papers (3DGS, Kerbl 2023, and those that
-    took over its tool) pass [0, 1], which gives other numbers. So the range is never guessed.
-
-    Arguments:
-        path: the ONNX file.
-        range_from: "-1" or "0", lower end of the range the model is given; None: what the file's metadata say. Stated
-            here it wins over the metadata, so that one file serves both variants.
-
-    Attributes:
-        variant: what is measured, for tables: file, range and its name.
-
-    Raises InputError when onnxruntime is missing, the file cannot be read, breaks the contract, or no range is known.
+    The model has two float32 inputs [1, 3, H, W] (image, then target) and one float32 output of a single element. The
+    constants inside LPIPS assume [-1, 1]; splatting papers (3DGS, Kerbl 2023, and those that took over its tool) pass
+    [0, 1], which gives other numbers. So the lower end of the range is never guessed: ``range_from`` ("-1" or "0"),
+    else the file's metadata say it. ``variant`` names file and range. Raises InputError for a file that breaks this.
     """
 
     def __init__(self, path: str | os.PathLike[str], range_from: str | None = None) -> None:

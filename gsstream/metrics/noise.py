@@ -24,9 +24,7 @@ def median_deviation(values: FloatArray) -> np.floating[Any]:
 def noise_sigma(first: FloatArray, second: FloatArray) -> float:
     """Return the standard deviation of one camera's noise in one image, [0, 1] units.
 
-    MAD of the differences times 1.4826, divided by sqrt 2 (a difference holds the noise of two images). The median is
-    taken out first, so an even change of exposure does not count; fewer than half of the pixels may move.
-
+    MAD of the differences around their median times 1.4826, divided by sqrt 2; fewer than half of the pixels may move.
     Images of 8 bits give a coarse answer (steps of about 1/255), and 0 where most pixels do not change at all.
     """
     check_pair(first, second)

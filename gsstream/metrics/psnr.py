@@ -13,12 +13,7 @@ Mask = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 
 
 def psnr(image: FloatArray, target: FloatArray, mask: Mask | None = None) -> float:
-    """Return -10 log10 of the mean squared error, dB, for a peak of 1.
-
-    It is of one image: means over images are means of dB.
-
-    Returns inf for equal images, nan for an empty mask. Raises ShapeError when shapes disagree.
-    """
+    """Return -10 log10 of the mean squared error of one image, dB; inf for equal ones, nan for an empty mask."""
     check_pair(image, target)
     error: FloatArray = np.subtract(image, target, dtype=np.float64)
     np.square(error, out=error)

@@ -22,9 +22,7 @@ _SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
 
 def ssim(image: FloatArray, target: FloatArray, border: Border = "zero") -> float:
-    """Return the mean SSIM of two [H, W, 3] images in [0, 1] (Wang et al. 2004).
-
-    By default images are padded as in 3DGS (Kerbl 2023).
+    """Return the mean SSIM of two [H, W, 3] images in [0, 1] (Wang et al. 2004), padded as in 3DGS by default.
 
     Computed in float64. Raises ShapeError when shapes disagree, or are smaller than a window where one must fit.
     """
@@ -36,14 +34,10 @@ def ssim(image: FloatArray, target: FloatArray, border: Border = "zero") -> floa
 
 
 def ms_ssim(image: FloatArray, target: FloatArray) -> float:
-    """Return the multi-scale SSIM of two [H, W, 3] images in [0, 1] (Wang, Simoncelli, Bovik 2003).
+    """Return the multi-scale SSIM of two [H, W, 3] images in [0, 1] (Wang, Simoncelli, Bovik 2003), in float64.
 
-    There are five scales, each half of the one before.
-
-    Scales by the mean of 2 x 2 pixels, a last odd row or column left out. Negative structure counts as 0, as in the
-    libraries, because it has no real power. Computed in float64.
-
-    Raises ShapeError when shapes disagree or a side is below 176 pixels: the coarsest scale must hold a window.
+    Five scales by the mean of 2 x 2 pixels, a last odd row or column left out; negative structure counts as 0. Raises
+    ShapeError when shapes disagree or a side is below 176 pixels: the coarsest scale must hold a window.
     """
     check_pair(image, target)
     least = (2 * _RADIUS + 1) << (len(_SCALES) - 1)

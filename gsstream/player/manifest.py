@@ -15,10 +15,8 @@ from gsstream.player.playback import Playback
 def manifest(stream: str | os.PathLike[str]) -> dict[str, Any]:
     """Return the byte ranges of a stream's packets; ``range`` is [first, last], inclusive as in HTTP.
 
-    The file header (``header``) followed by the bytes from any key packet on is a stream of its own: a client that
-    joins late asks for both. ``segments`` are those pieces: a key packet with what follows up to the next one.
-
-    Raises PacketError for a damaged stream, SourceError when there is none.
+    The file header (``header``) followed by any of the ``segments`` (a key packet with what follows up to the next) is
+    a stream of its own. Raises PacketError for a damaged stream, SourceError when there is none.
     """
     with StreamReader(stream) as reader:
         reader.check()

@@ -14,13 +14,7 @@ from gsstream.core.shapes import FloatArray
 
 
 def ply_properties(sh_rest: int) -> list[str]:
-    """Return the names of the float32 properties of a scene with K - 1 = ``sh_rest`` higher coefficients.
-
-    They stand in the order of the file.
-
-    Names, order and conventions are those that the 3D Gaussian Splatting release writes: view-dependent colour channel
-    by channel, opacity as logit, scales as logarithm, quaternion wxyz, normals all zero.
-    """
+    """Return the names, as in the 3DGS release, of the float32 properties of a scene with ``sh_rest`` coefficients."""
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(3 * sh_rest)]
     return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]

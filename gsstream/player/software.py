@@ -22,13 +22,7 @@ def render_numpy(
     arrays: Sequence[FloatArray], viewmat: FloatArray, K: FloatArray, width: int, height: int,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0), near: float = 0.01,
 ) -> FloatArray:  # fmt: skip
-    """Render raw Gaussians for one camera: [height, width, 3] float32.
-
-    Arguments:
-        arrays: means, quats, scales, opacities, sh0 and shN, in this order.
-        viewmat, K: [4, 4] world to camera (OpenCV), [3, 3] pixels.
-        background, near: colour 0 to 1; near plane in scene units.
-    """
+    """Render raw Gaussians (means, quats, scales, opacities, sh0, shN) for one camera: [height, width, 3] float32."""
     means, quats, scales, opacities, sh0, shN = arrays
     viewmat, K = np.asarray(viewmat, np.float64), np.asarray(K, np.float64)
     center = -viewmat[:3, :3].T @ viewmat[:3, 3]

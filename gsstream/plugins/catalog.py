@@ -73,9 +73,7 @@ class Catalog:
     def resolve(self, kind: str, name: str) -> Any:
         """Import a part's class and hold it against its kind; of a command, its function or Typer app.
 
-        Raises:
-            PluginUnavailable: quarantined, not importable, or not what its declaration says.
-            UnknownName: no plugin declares it.
+        Raises UnknownName for one that no plugin declares, PluginUnavailable for one that is not what it declares.
         """
         entry = self.entry(kind, name)
         assert not isinstance(entry.spec, MethodSpec), "methods shipped as recipes have no class"

@@ -71,11 +71,7 @@ class Layer:
 
 
 def read_file(path: Path, label: str | None = None) -> Layer:
-    """Read a YAML file as a layer.
-
-    Raises:
-        RecipeError: unreadable, not YAML, a key given twice, an anchor, a value that is no JSON value.
-    """
+    """Read a YAML file as a layer. Raises RecipeError for what is no YAML, a key given twice, an anchor."""
     text = _text_of(path)
     root = _compose(text, str(path))
     if root is None:
@@ -118,11 +114,7 @@ def is_file(path: Path) -> bool:
 
 
 def read_override(text: str, option: str = "--set") -> tuple[KeyPath, Leaf]:
-    """Read one ``a.b=value`` of the command line; the value is YAML.
-
-    Raises:
-        RecipeError: no "=", an empty key or value, or a value that is not YAML.
-    """
+    """Read one ``a.b=value`` of the command line; the value is YAML. Raises RecipeError."""
     where = f"{option} {text}"
     key, equals, value = text.partition("=")
     path = tuple(key.strip().split("."))

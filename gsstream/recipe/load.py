@@ -121,11 +121,7 @@ def load_recipe(path: Path) -> ResolvedRecipe:
 
 
 def stack(layers: Sequence[Layer]) -> ResolvedRecipe:
-    """Merge layers, lowest first, check every key and validate the whole.
-
-    Raises:
-        RecipeError: all problems together.
-    """
+    """Merge layers, lowest first, check every key and validate the whole. Raises RecipeError with all problems."""
     problems: list[str] = []
     merged: dict[KeyPath, Leaf] = {}
     for layer in layers:

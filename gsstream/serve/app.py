@@ -27,13 +27,9 @@ STREAM, MANIFEST, SOCKET = "/stream.gss", "/stream.json", "/live"
 
 @dataclass(frozen=True)
 class Rules:
-    """Who may look.
+    """Who may look: with which token, from which other pages (origins), by which names of this server (hosts).
 
-    Attributes:
-        token: what the address must end with (``?token=...``); None: nothing.
-        origins: other web pages that may use the stream, as scheme://host[:port].
-        hosts: names by which this server may be asked; None: any. A page elsewhere that gives itself the address of
-            this machine is kept out by it.
+    None: anyone. A page elsewhere that gives itself the address of this machine is kept out by ``hosts``.
     """
 
     token: str | None = None

@@ -16,13 +16,7 @@ FLOOR = 0.01
 def equal(what: str, got: torch.Tensor, expected: torch.Tensor, tolerance: float = 0.0, why: str = EXACT) -> None:
     """Raise AssertionError unless shape and dtype agree and no value is farther off than ``tolerance``.
 
-    ``tolerance`` is absolute up to a magnitude of 1 and relative above.
-
-    Arguments:
-        what: is compared, for the message.
-        got, expected: tensors.
-        tolerance: absolute up to a magnitude of 1, relative above.
-        why: the tolerance is what it is.
+    ``tolerance`` is absolute up to a magnitude of 1 and relative above; ``why`` says why it is what it is.
     """
     assert got.shape == expected.shape, f"{what}: expected shape {list(expected.shape)}, got {list(got.shape)}"
     assert got.dtype == expected.dtype, f"{what}: expected {expected.dtype}, got {got.dtype}"
@@ -43,14 +37,7 @@ def all_equal(
     what: str, got: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor], tolerance: float = 0.0,
     why: str = EXACT,
 ) -> None:  # fmt: skip
-    """Apply :func:`equal` to every named tensor; the names must agree too.
-
-    Arguments:
-        what: is compared, for the message.
-        got, expected: name -> tensor.
-        tolerance: as for :func:`equal`.
-        why: the tolerance is what it is.
-    """
+    """Apply :func:`equal` to every named tensor; the names must agree too."""
     assert set(got) == set(expected), f"{what}: expected the outputs {sorted(expected)}, got {sorted(got)}"
     for name, value in expected.items():
         equal(f"{what}: {name}", got[name], value, tolerance, why)
@@ -59,15 +46,7 @@ def all_equal(
 def relative(
     what: str, got: torch.Tensor, expected: torch.Tensor, tolerance: float, why: str, *, floor: float
 ) -> None:
-    """Apply :func:`equal` to fractions of the largest expected value.
-
-    Arguments:
-        what: is compared, for the message.
-        got, expected: tensors.
-        tolerance: fraction of the largest expected value.
-        why: the tolerance is what it is.
-        floor: the largest value is taken to be at least this, because below it there is only rounding.
-    """
+    """Apply :func:`equal` to fractions of the largest expected value, which is taken to be at least ``floor``."""
     assert floor > 0, f"{what}: expected a floor above 0, got {floor}"
     scale = max(float(expected.abs().max()), floor) if expected.numel() else 1.0
     equal(f"{what}, as fractions of {scale:.3g}", got / scale, expected / scale, tolerance, why)
@@ -76,14 +55,7 @@ def relative(
 def gradients_equal(
     what: str, got: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor], tolerance: float, why: str
 ) -> None:
-    """Apply :func:`relative` to every gradient of a scene, each with the same floor; the names must agree too.
-
-    Arguments:
-        what: is compared, for the message.
-        got, expected: name -> gradient.
-        tolerance: fraction of the largest expected value of that name.
-        why: the tolerance is what it is.
-    """
+    """Apply :func:`relative` to every gradient of a scene, each with the same floor; the names must agree too."""
     assert set(got) == set(expected), f"{what}: expected gradients of {sorted(expected)}, got {sorted(got)}"
     largest = max(float(value.abs().max()) for value in expected.values() if value.numel())
     assert largest > 0, f"{what}: every expected gradient is 0, so nothing would be compared"
@@ -92,15 +64,7 @@ def gradients_equal(
 
 
 def at_most(what: str, got: torch.Tensor, bound: torch.Tensor | float, tolerance: float, why: str) -> None:
-    """Raise AssertionError unless every value is <= ``bound`` + ``tolerance``; NaN never is.
-
-    Arguments:
-        what: is compared, for the message.
-        got: a tensor.
-        bound: that it must not exceed.
-        tolerance: added to the bound.
-        why: the bound holds.
-    """
+    """Raise AssertionError unless every value is <= ``bound`` + ``tolerance``; NaN never is."""
     if got.numel() == 0:
         return
     limit = torch.as_tensor(bound, dtype=torch.float64).expand(got.shape)

@@ -55,23 +55,12 @@ def outputs(part: Part, world: World) -> Outputs:
 
 
 def draw(part: GateSampler, number: int, seed: int = 7) -> torch.Tensor | None:
-    """Draw noise from a fresh generator.
-
-    Arguments:
-        part: a gate.
-        number: of nodes.
-        seed: of the generator.
-    """
+    """Draw the noise of a gate from a fresh generator."""
     return part.noise(number, torch.Generator().manual_seed(seed))
 
 
 def poisons_of(*paths: str, usual: tuple[float, float] = (0.75, 0.25)) -> tuple[Poison, ...]:
-    """Return a poison of one value for each path of an array in a world; a refusal must name its last word.
-
-    Arguments:
-        paths: such as "gaussians.means".
-        usual: two values that it may have.
-    """
+    """Return a poison of one value for each path of an array in a world, such as "gaussians.means"."""
 
     def put(path: str, world: World, value: float) -> None:
         array: Any = operator.attrgetter(path)(world)

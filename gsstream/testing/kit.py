@@ -43,13 +43,7 @@ class CheckResult:
 
 
 def run_check(entry: Check, subject: Any, expected: str | None = None) -> CheckResult:
-    """Make one check; whatever the part raises is a failure with its name.
-
-    Arguments:
-        entry: the check.
-        subject: a part, or what stands for one (a source on a recording, a method, a packet codec).
-        expected: why the check must fail; None: it must pass.
-    """
+    """Make one check on a subject; ``expected`` says why it must fail (None: it must pass)."""
     name = repr(subject)
     try:
         if entry.trait is not None and not claimed(subject, entry.trait):
@@ -98,13 +92,7 @@ def run_checks(part: Part | SourceUnderTest, expected_failures: Mapping[str, str
 
 
 def skip_checks(kind: str, name: str, reason: str) -> list[CheckResult]:
-    """Return what :func:`run_checks` says of a part that cannot be made here: every check of its kind is skipped.
-
-    Arguments:
-        kind: of the part.
-        name: of the part.
-        reason: why it cannot be made here.
-    """
+    """Return what :func:`run_checks` says of a part that cannot be made here: every check of its kind is skipped."""
     return [CheckResult(entry.name, name, "skipped", reason) for entry in checks_for(kind)]
 
 
@@ -117,12 +105,7 @@ def run_method_checks(name: str, expected_failures: Mapping[str, str] | None = N
 
 
 def run_command_checks(spec: CommandSpec, origin: str = "here") -> list[CheckResult]:
-    """Make the checks of commands on one that is declared.
-
-    Arguments:
-        spec: the declaration.
-        origin: distribution that errors name.
-    """
+    """Make the checks of commands on one that is declared; errors name its ``origin``."""
     return run_subject("command", CommandUnderTest(spec, origin))
 
 
@@ -132,13 +115,7 @@ def run_packet_checks(codec: PacketCodec | None = None) -> list[CheckResult]:
 
 
 def run_subject(kind: str, subject: Any, expected: Mapping[str, str] | None = None) -> list[CheckResult]:
-    """Make every check of a kind on something that is no part of a recipe.
-
-    Arguments:
-        kind: of the checks.
-        subject: a method, a packet codec, a source.
-        expected: check -> why it must fail.
-    """
+    """Make every check of a kind on a method, a packet codec or a source; ``expected``: check -> why it must fail."""
     given = dict(expected or {})
     entries = checks_for(kind)
     _check_reasons(given, [entry.name for entry in entries])

@@ -43,11 +43,7 @@ def _before() -> tuple[MethodUnderTest, Step[Any]]:
 
 
 def fit_fixture(*, changed: bool = True) -> FitFixture:
-    """Return frame 2 of a tiny recording, to be worked on.
-
-    Arguments:
-        changed: as the images say; False: no tile of any view counts as changed.
-    """
+    """Return frame 2 of a tiny recording, to be worked on; with ``changed`` false no tile counts as changed."""
     method, step = _before()
     state, frame = step.state, open_source(SOURCE).frame(2)
     change = detect_changed_tiles(state.previous, frame, THRESHOLD)

@@ -174,14 +174,10 @@ BLOCK = 1 << 13
 def evaluate_network(
     shape: FieldShape, unit: FloatArray, touched: list[IntArray], entries: list[IntArray], weights: list[IntArray]
 ) -> FloatArray:
-    """Return the outputs of the network at positions: [A, 7] float64, multiples of 2^-34.
+    """Return the outputs of the network at places ``unit`` [A, 3] in [0, 1]: [A, 7] float64, multiples of 2^-34.
 
-    Arguments:
-        shape: of the field.
-        unit: [A, 3] places in units of the box, 0 to 1.
-        touched: for each level, [E] the entries that these places touch, or more, ascending.
-        entries: for each level, [E, F] whole numbers of 2^-20 at these entries.
-        weights: for each layer, [inputs, outputs] whole numbers of 2^-14.
+    For each level, ``touched`` [E] are the entries that these places touch, ascending, and ``entries`` [E, F] their
+    whole numbers of 2^-20; ``weights`` are, for each layer, [inputs, outputs] whole numbers of 2^-14.
     """
     ranks = np.zeros((shape.levels, 1 << shape.entries), np.int32)
     for rank, which in zip(ranks, touched, strict=True):

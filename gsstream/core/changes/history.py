@@ -34,13 +34,7 @@ class Displacement:
 def displacement_between(
     before: Gaussians[FloatArray], after: Gaussians[FloatArray], rows: IntArray
 ) -> Displacement | None:
-    """Measure how far a frame moved and turned rows; None when nothing moved.
-
-    Arguments:
-        before: scene of the frame before, raw values.
-        after: scene after motions and residual, the same N rows.
-        rows: [A] int64, ascending, all that the frame may have touched.
-    """
+    """Measure how far a frame moved and turned ``rows`` [A], all that it may have touched; None: nothing moved."""
     with np.errstate(over="ignore"):  # beyond float32 it is infinite; a motion predicted from that is refused
         translation = after.means.take(rows, 0) - before.means.take(rows, 0)
     rotation = rotation_between(before.quats.take(rows, 0), after.quats.take(rows, 0))

@@ -105,14 +105,10 @@ def assemble(
     resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | None = None,
     live: Mapping[str, Part] = MappingProxyType({}),
 ) -> Assembly:  # fmt: skip
-    """Import every named part, check its parameters against its own Config, and build it.
+    """Import every named part, or take it from ``live`` (slot -> part), check its parameters, and build it.
 
-    ``live``: slot -> part that takes the place of the one the recipe names.
-
-    Raises:
-        InputError: ``checks`` is not a level, or a live part does not fit its slot.
-        RecipeError: parameters that a part does not know or refuses, unknown parts; all of them together.
-        PluginUnavailable: a part's plugin is in quarantine or the part is not what it claims to be.
+    Raises RecipeError with all that is wrong with the recipe, InputError for a level of checks or a live part that does
+    not fit, PluginUnavailable for a part whose plugin is in quarantine or that is not what it claims to be.
     """
     level = requested_checks(checks)
     if isinstance(resolved, Recipe):

@@ -37,10 +37,7 @@ class Checks(StrEnum):
 
 
 def requested_checks(given: str | None = None) -> Checks:
-    """Return the level asked for: ``given``, else that of the environment, else "frame".
-
-    Raises InputError for anything but the three levels.
-    """
+    """Return the level ``given``, else that of the environment, else "frame". Raises InputError for any other."""
     where = "checks" if given is not None else VARIABLE
     text = given if given is not None else os.environ.get(VARIABLE, "") or Checks.FRAME
     try:
@@ -128,10 +125,7 @@ class Look:
 def wrong_value(
     value: torch.Tensor, limits: tuple[float, float] | None = None, rows: torch.Tensor | None = None
 ) -> str:
-    """Say which number is not finite or not within the limits; empty when all are.
-
-    ``rows`` as in :meth:`Look.values`.
-    """
+    """Say which number is not finite or not within the limits; empty when all are."""
     if value.numel() == 0:
         return ""
     value = value.detach()

@@ -44,14 +44,9 @@ def requested_device(environment: Mapping[str, str] = os.environ) -> str:
 
 
 def choose_renderer(catalog: Catalog, processor_only: str = "") -> Chosen:
-    """Return the fastest renderer that works here.
+    """Return the fastest renderer that works here; ``processor_only``: why the parts cannot use a GPU, or empty.
 
-    Arguments:
-        processor_only: why the parts of the run cannot work with tensors of a GPU; empty where they can.
-
-    Raises:
-        InputError: GSSTREAM_DEVICE has a value that it cannot have.
-        PluginUnavailable: it asks for a GPU, and none can be used; the message says why.
+    Raises InputError for a GSSTREAM_DEVICE that it cannot have, PluginUnavailable where it asks for a GPU in vain.
     """
     device, note = requested_device(), ""
     if device != "cpu":

@@ -68,11 +68,7 @@ def _line_of(error: Exception, part: object) -> str:
 
 
 class Guarded:
-    """Calls a part and stands in its place: attributes that are no functions are the part's own.
-
-    What its functions raise passes :func:`error_context`; what they return is checked
-    (``engine.assembly.output_checks``).
-    """
+    """Calls a part and stands in its place; what it raises names the part, what it returns is checked."""
 
     def __init__(self, slot: str, part: object, where: Where, level: Checks, kind: str = "") -> None:
         self._slot, self._part, self._where, self._level = slot, part, where, level

@@ -65,9 +65,7 @@ class Allowance:
 class EpochScheduler(Schedule):
     """Passes and weight of one frame under a budget, corrected by what its own passes take.
 
-    Arguments:
-        epochs, rd_lambda: of the plan. views: iterations of a pass.
-        epoch_scale: share of the passes that the frame is worth, and of the time that they have.
+    ``epoch_scale``: share of the passes that the frame is worth, and of the time that they have.
     """
 
     def __init__(
@@ -153,13 +151,7 @@ class EpochScheduler(Schedule):
         self.stopped_by_clock = self.epochs == done < self._most
 
     def _last_epoch_seconds(self) -> list[float]:
-        """Seconds of the iterations of the last pass.
-
-        The first iteration of the frame is left out: it includes work that is done once per frame, and a pass that is
-        thought to be that slow would end the frame at once.
-
-        Without the frame's first, which pays for what is made ready once: as typical it would end the frame there.
-        """
+        """Seconds of the iterations of the last pass, without the frame's first, which pays for what is made once."""
         return self._iterations[1:][-self._views :]
 
     def weigh_bytes(self, done: int, estimate: Callable[[], float]) -> None:

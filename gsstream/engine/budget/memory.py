@@ -35,9 +35,7 @@ def min_memory(info: SourceInfo, recipe: Recipe) -> int:
 
 
 def limit_memory(parts: Assembly, info: SourceInfo) -> Assembly:
-    """Return the parts with limits on Gaussians and caches that the budget of memory can hold.
-
-    These are ``first_frame.max_gaussians`` and the renderer's ``cache_mb``.
+    """Return the parts with limits on Gaussians and on the renderer's cache that the budget of memory can hold.
 
     Raises InputError when the budget is below what any run of this recording needs.
     """

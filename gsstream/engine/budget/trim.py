@@ -46,10 +46,7 @@ def trim_to_size(
     delta: Delta, packet: EncodedPacket, curvature: Mapping[str, FloatArray], layout: Layout,
     encode: Callable[[Delta], EncodedPacket], max_bytes: int,
 ) -> TrimmedDelta:  # fmt: skip
-    """Return the delta, with as little given up as makes its packet fit; unchanged when it fits already.
-
-    Raises AssertionError when not even the empty packet fits: a budget's least size forbids that.
-    """
+    """Return the delta, with as little given up as makes its packet fit; unchanged when it fits already."""
     untrimmed = len(packet.data)
     if untrimmed <= max_bytes:
         return TrimmedDelta(delta, packet, untrimmed)

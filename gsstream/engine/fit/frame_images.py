@@ -10,12 +10,7 @@ from gsstream.core.storage import packed, unpacked
 
 
 class FrameImages:
-    """The images of one frame as float32 tensors [H, W, 3] on a device, each copied when it is first asked for.
-
-    Arguments:
-        images: [V, H, W, 3] as they are stored.
-        device: to which they cross as bytes where these say the same. On the processor nothing is copied or kept.
-    """
+    """The images of one frame as float32 tensors [H, W, 3] on a device, copied (as bytes) when first asked for."""
 
     def __init__(self, images: Any, device: torch.device) -> None:
         self._images, self.device = images, device

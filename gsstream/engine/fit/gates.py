@@ -14,16 +14,7 @@ from gsstream.parts.render.backward import backward
 
 
 class TrainedGates:
-    """Logits of the gates that have candidates behind them, moved by images and penalty.
-
-    Arguments:
-        gate, regularizer, optimiser: the parts.
-        lr: learning rate of the logits.
-        logits: [M] of all gates, as the frame begins.
-        hierarchy: of the scene.
-        rows: [A] candidates.
-        generator: of the gates' noise.
-    """
+    """Logits of the gates that have candidates (``rows`` [A]) behind them, moved by images and penalty."""
 
     def __init__(
         self, gate: GateSampler, regularizer: Regularizer, optimiser: RowOptimiser, lr: float, logits: torch.Tensor,

@@ -16,13 +16,7 @@ from gsstream.parts.render.target import ViewTarget
 
 
 class PhotometricLoss:
-    """The photometric loss of one frame's views.
-
-    Arguments:
-        loss: the part; dssim: its weight of 1 - SSIM.
-        images: what the cameras recorded. What the loss makes of an image is made when it is first needed.
-        exposure: colour maps of the cameras on the device of the images, or None.
-    """
+    """The photometric loss of one frame's views; ``dssim`` is the weight of 1 - SSIM."""
 
     def __init__(
         self, loss: Loss, dssim: float, images: FrameImages, exposure: Exposure | None

@@ -27,10 +27,9 @@ REFINED = "refined"
 
 
 def key_packet_if_due(parts: Assembly, step: Step, frame: Frame, tools: Tools) -> Step:
-    """Return ``step``, or when the recipe asks for a key packet at this frame, the step that writes one instead of it.
+    """Return ``step``, or when a key packet is due at this frame, the step that writes one instead.
 
-    A key packet that the budget refuses, or whose frame is skipped, stays due: the next frame tries again. Pure, like a
-    frame step.
+    A key packet that the budget refuses, or whose frame is skipped, stays due: the next frame tries again.
     """
     reason, state = _due(parts, step), step.state
     if reason is None:

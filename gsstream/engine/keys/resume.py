@@ -36,10 +36,7 @@ class Ended(NamedTuple):
 
 
 def read_end(path: Path, last: int | None = None) -> Ended:
-    """Decode a stream to its last sound packet.
-
-    Raises PacketError when not even the first key packet is sound.
-    """
+    """Decode a stream to its last sound packet. Raises PacketError when not even the first is sound."""
     player: PlayerState | None = None
     shown = key = 0
     for player, kind in _decoded_states(path, last):
@@ -76,10 +73,7 @@ def _decoded_states(path: Path, last: int | None) -> Iterator[tuple[PlayerState,
 
 
 def check_stream(parts: Assembly, path: Path, info: SourceInfo) -> bool:
-    """Say whether a stream has a complete frame 0 to go on from.
-
-    Raises OutputError when the recipe or the recording is not the one it was written with.
-    """
+    """Say whether a stream has a complete frame 0. Raises OutputError for another recipe or recording than its own."""
     if path.stat().st_size < FILE_HEADER.size:
         return False
     with StreamReader(path) as reader:
@@ -92,10 +86,7 @@ def check_stream(parts: Assembly, path: Path, info: SourceInfo) -> bool:
 
 
 def state_after(parts: Assembly, states: Iterable[PlayerState], rng: Rng) -> StreamState:
-    """Return the encoder state after these player states, the first of which is that of a key packet.
-
-    ``previous`` is not set: no stream holds images.
-    """
+    """Return the state after these player states, the first that of a key packet; ``previous`` is not set."""
     state: StreamState | None = None
     for player in states:
         if state is None:

@@ -14,12 +14,7 @@ from gsstream.packet import PlayerState
 
 
 class Budgeted(StreamingMethod[Any]):
-    """Calls a method and lends it ``tools.budget``; the controller learns what its frames cost.
-
-    Arguments:
-        method: any method. One that does not look at ``tools.budget`` is measured against it all the same.
-        controller: plans the frames of this run.
-    """
+    """Calls a method and lends it ``tools.budget``; the controller learns what its frames cost."""
 
     source = "gsstream"
     _method: StreamingMethod[Any]

@@ -22,10 +22,7 @@ def displacement_pixels(player: PlayerState, cameras: Cameras) -> dict[str, floa
 
 
 def screen_displacement(before: FloatArray, after: FloatArray, cameras: Cameras) -> FloatArray:
-    """Return [P] the distance on the screen between two places of each point, pixels, mean over the cameras.
-
-    A camera counts that has both places in its picture; nan where none has.
-    """
+    """Return [P] pixels between two places of each point, mean over the cameras that see both; nan: none does."""
     total, count = np.zeros(len(before)), np.zeros(len(before))
     for view in range(len(cameras)):
         (start, near), (end, far) = project(before, cameras, view), project(after, cameras, view)

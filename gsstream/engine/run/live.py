@@ -21,10 +21,8 @@ _WORDS: Mapping[str, str] = {
 def live_metrics(frame: Frame, written: float) -> dict[str, Any] | None:
     """Return the entry ``live`` of a frame's metrics; None for a recording that is not live.
 
-    ``latency_seconds``: from the moment when the frame's last image was complete to the moment when its packet was;
-    None when its files were gone by then. It is not bounded below: a negative one says that the clock which dates the
-    images is ahead. ``policy``: what the options of the source did to the frame, None for nothing.
-    ``epoch_scale``: share of the recipe's epochs that was asked for. ``absent``: training cameras without an image.
+    The latency runs from the moment when the last image was complete to that when the packet was. It is None when the
+    files were gone by then, and negative where the clock that dates the images is ahead.
     """
     arrival = frame.arrival
     if arrival is None:

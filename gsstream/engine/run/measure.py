@@ -51,10 +51,7 @@ class HeldOut:
         return out
 
     def doubt(self, state: MethodState, train: Frame, measured: Mapping[str, float | None]) -> str:
-        """Say when frame 0 shows the training cameras what they saw and the held-out cameras something else.
-
-        Returns one line for a person; empty where there is nothing to say.
-        """
+        """Say in a line when frame 0 shows the training cameras what they saw and the held-out ones something else."""
         held_out = [value for value in measured.values() if value is not None]
         if not held_out or float(np.mean(held_out)) >= LOW_PSNR_DB:
             return ""

@@ -45,12 +45,7 @@ def last_written(path: Path) -> int:
 
 
 def trim_metrics(path: Path, last: int) -> list[dict[str, Any]]:
-    """Drop the lines of frames that the stream does not hold, and return the lines that are kept.
-
-    A kill can fall between a packet and its line.
-
-    The file is replaced at once: a kill leaves it as it was or as it is to be.
-    """
+    """Drop the lines of frames that the stream does not hold (a kill came between), and return those kept."""
     kept = [line for line in _written(path) if int(line["frame"]) <= last]
     if path.exists():
         write_whole(path, "".join(json.dumps(line) + "\n" for line in kept))

@@ -162,15 +162,7 @@ def ended_by_signals(names: tuple[str, ...] = ("SIGTERM", "SIGHUP")) -> Iterator
 
 
 def prepare_output(out: Path, *, resume: bool = False, overwrite: bool = False) -> bool:
-    """Make sure a run may write to ``out``; create it when missing.
-
-    Returns:
-        Whether there is a run to continue.
-
-    Raises:
-        OutputError: it holds a run and neither is asked for; both are asked for; resume without a run; not a writable
-            folder.
-    """
+    """Make sure a run may write to ``out``, and say whether there is a run to continue. Raises OutputError if not."""
     present = check_output(out, resume=resume, overwrite=overwrite)
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -62,10 +62,7 @@ class RunProgress(Signs):
 
 
 def frame_line(metrics: Mapping[str, Any], total: int | None) -> str:
-    """Return ``frame 3/29: 27.31 dB (moving 24.90), 8.4 KB, 0.52 s, 4.1 % sent``.
-
-    ``total`` is None while it is unknown.
-    """
+    """Return ``frame 3/29: 27.31 dB (moving 24.90), 8.4 KB, 0.52 s, 4.1 % sent``; ``total`` may be unknown."""
     values = [v for v in metrics.get("psnr", {}).values() if v is not None]
     moving = [v for v in metrics.get("psnr_moving", {}).values() if v is not None]
     parts = []

@@ -38,11 +38,7 @@ def open_recording(uri: str, recipe: Recipe, catalog: Catalog) -> FrameSource:
 
 
 def reopen_recording(uri: str, recipe: Mapping[str, Any], catalog: Catalog) -> FrameSource:
-    """Open ``uri`` as the run did whose recipe a stream carries (``StreamMeta.recipe``).
-
-    Raises RecipeError when the stream's recipe has data options that this version does not know, else as
-    :func:`open_recording`.
-    """
+    """Open ``uri`` as the run did whose recipe a stream carries. Raises RecipeError for unknown data options."""
     try:
         data = DataOptions.model_validate_json(json.dumps(recipe.get("data", {})))
     except ValidationError as error:

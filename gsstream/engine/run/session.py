@@ -198,11 +198,7 @@ def _num_frames(info: SourceInfo, wanted: int | None) -> int | None:
 
 
 def _timed(frames: Prefetcher, source: FrameSource) -> Iterator[tuple[Frame, Frame, float]]:
-    """(train, test, seconds waited for decoding) of every frame.
-
-    Frames are read ahead, and the run may have fallen behind since: an adaptive source is asked again for their epoch
-    scale.
-    """
+    """(train, test, seconds waited) of every frame; an adaptive source is asked again for the epoch scale."""
     while True:
         started = time.perf_counter()
         try:

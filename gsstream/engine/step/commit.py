@@ -33,10 +33,9 @@ def keep(
 def commit_session(
     view: EngineContext, scene: Scene, delta: Delta, player: PlayerState
 ) -> tuple[RenderSession, Gaussians[torch.Tensor]] | None:
-    """Return the session of the decoded scene, in which everything that did not change is still projected and sorted.
+    """Return the session of the decoded scene, with what did not change still projected, and the scene itself.
 
-    With it the scene itself, on the renderer's device. None where keeping costs more than it saves: rows came or went,
-    or most of them changed.
+    None where keeping costs more than it saves: rows came or went, or most of them changed.
     """
     if delta.has_row_edit:
         return None

@@ -33,14 +33,7 @@ class EngineContext:
     """One frame over a decoded scene (implements ``render.work.FitContext`` and ``method.tools.FrameTools``).
 
     Images are as recorded; gradients are backpropagated through the camera's colour map, so that parts need not know
-    it.
-
-    Arguments:
-        state: that before the frame: the decoded scene, its groups, and the training images that it shows.
-        log: the record of the frame.
-        change: what changed since; None: everything counts as changed.
-        part_scale: share of their usual passes that parts make, above 0 to 1.
-        images: of the frame, where some are on the renderer's device already.
+    it. ``change`` is what changed since the scene was shown; None: everything counts as changed.
     """
 
     def __init__(

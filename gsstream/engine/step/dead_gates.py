@@ -13,9 +13,7 @@ RESOLUTION = 2.0**-24
 def count_dead_gates(gate: GateSampler, logits: torch.Tensor) -> int:
     """Count the gates with these logits [M] that neither the images nor the price can move.
 
-    Dead: the derivatives by the logit both of the deterministic gate (through which the images act) and of the open
-    probability (through which the price acts) are below RESOLUTION. Samplers that do not depend on their logits have
-    nothing to move and no dead gates.
+    Of a dead gate the derivatives of the deterministic gate and of the open probability are below RESOLUTION.
     """
     leaf = logits.detach().clone().requires_grad_()
     with torch.enable_grad():

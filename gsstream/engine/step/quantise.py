@@ -21,9 +21,7 @@ MAX_INT32_SYMBOL = 2.0**31 - 256
 
 
 def quantise_residual(parts: Assembly, problem: Problem, solution: Solution) -> Residual | None:
-    """Return the transmitted integers; None when nothing changes.
-
-    A gate behind which every symbol is zero is closed: it would cost bits and change nothing.
+    """Return the transmitted integers; None when nothing changes. A gate that opens for zeros alone is closed.
 
     Raises ComponentError when what was learned cannot be sent: not finite, or beyond symbols of 32 bits.
     """

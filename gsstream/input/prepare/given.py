@@ -33,10 +33,7 @@ class GivenRig:
 
 
 def read_raw(source: str) -> tuple[str, list[RawCamera], GivenRig | None]:
-    """Return name and cameras of a recording, and its calibration where it has one.
-
-    Arguments:
-        source: a folder of any layout that a run reads, by its files or as ``LAYOUT:DIR``, or of pictures or videos.
+    """Return name, cameras and calibration, if any, of a recording that a run reads, or of pictures or videos.
 
     Raises SourceError for anything else.
     """

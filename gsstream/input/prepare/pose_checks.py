@@ -36,12 +36,9 @@ STAND_OUT, SUSPECTS, EXCHANGED = 0.8, 6, 1.7
 
 
 def first_look(source: FrameSource) -> list[Finding]:
-    """Return what is wrong with the poses of a recording, as far as its rig and its first frame say it at once.
+    """Return what is wrong with the poses, as far as the rig and the first frame say it in a fraction of a second.
 
-    A part of ``scene validate`` that takes a fraction of a second. Test cameras take part in the last check alone, of
-    poses that are swapped. Pictures of a recording that still grows are not waited for.
-
-    Raises SourceError when frame 0 cannot be read.
+    Test cameras take part in the check of swapped poses alone. Raises SourceError when frame 0 cannot be read.
     """
     source = to_file_coordinates(source)
     train = source.info.train

@@ -67,14 +67,7 @@ class Prepared:
 
 
 def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say, tell: Tell = silent) -> Prepared:
-    """Make the scene ``out`` (cameras.json, pictures, points_frame0.npz).
-
-    Arguments:
-        raw: a raw recording, or one of any layout that a run reads; poses and lenses that come with it are kept.
-        out: folder of the scene.
-        options: how it is made.
-        say: gets a sentence for every step.
-        tell: gets what is done, and how much of it.
+    """Make the scene ``out`` (cameras.json, pictures, points_frame0.npz), with poses and lenses that ``raw`` brings.
 
     Raises SourceError for a raw recording that cannot be read, InputError when structure from motion fails or finds
     fewer than two training cameras, OutputError when ``out`` exists and is not an empty folder.

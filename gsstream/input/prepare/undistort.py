@@ -38,9 +38,7 @@ class Undistortion:
 
 
 def undistortion(lens: Lens, size: tuple[int, int], target: tuple[int, int]) -> Undistortion:
-    """Return the widest pinhole of ``target`` pixels that sees only what the lens saw.
-
-    The principal point is the lens's.
+    """Return the widest pinhole of ``target`` pixels that sees only what the lens saw, with its principal point.
 
     Raises InputError when no pinhole up to three times the lens's focal length is covered (a wrong lens model).
     """

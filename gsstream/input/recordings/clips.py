@@ -45,11 +45,7 @@ class Clip(Protocol):
 
 
 class ImageClip:
-    """Image files in the given order, 8 or 16 bit.
-
-    Arguments:
-        files: at least one.
-        first: number of the first file.
+    """Image files in the given order, 8 or 16 bit, the first of which has the number ``first``.
 
     Raises SourceError when a file is missing or the first one is not an image.
     """
@@ -101,11 +97,7 @@ def _size_of(path: Path) -> tuple[int, int]:
 
 
 def prepare_command(source: str) -> str:
-    """Return the command that makes a scene of a recording which cannot be run as it is, for messages.
-
-    Arguments:
-        source: as it was asked for, with a query or without one.
-    """
+    """Return the command that makes a scene of a recording which cannot be run as it is, for messages."""
     source = source.partition("?")[0]
     out = Path(source.rpartition(":")[2]).resolve().name + "-prepared"
     return f"gsstream scene prepare {shlex.quote(source)} --out {shlex.quote(out)}"

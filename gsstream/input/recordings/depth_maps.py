@@ -19,19 +19,10 @@ SAME_SHAPE = 0.01
 
 
 def read_depth_maps(folder: Path | None, cameras: Cameras, unit: float = 1.0) -> FloatArray | None:
-    """Read what a recording's folder ``depth_frame0`` knows, brought to the size of the cameras' pictures.
+    """Return the maps of a folder ``depth_frame0`` at the size of the cameras: [C, H, W] planar depth, NaN: unknown.
 
-    A file is [h, w], planar depth in units of the files' poses; 0, NaN or infinite where nothing is known.
-
-    Arguments:
-        folder: the folder; None, or one that is not there: nothing is known.
-        cameras: C cameras.
-        unit: units of the files' poses in one unit of the cameras'.
-
-    Returns:
-        [C, H, W] float32 in units of the cameras, NaN where nothing is known; None where no camera has a map.
-
-    Raises SourceError naming a file that cannot be read or does not fit the pictures.
+    A file is [h, w] in units of the files' poses, of which the cameras' unit has ``unit``; 0, NaN or infinite where
+    nothing is known. None where no camera has a map. Raises SourceError for a file that cannot be read or does not fit.
     """
     if folder is None:
         return None

@@ -54,9 +54,7 @@ def _series(square: FloatArray, coefficients: tuple[float, ...]) -> FloatArray:
 
 
 def pinhole_intrinsics(lens: Lens, K: FloatArray, size: tuple[int, int], where: str) -> FloatArray:
-    """Return intrinsics [3, 3] of the widest pinhole image without empty corners.
-
-    Size and principal point stay.
+    """Return intrinsics [3, 3] of the widest pinhole image without empty corners, same size and principal point.
 
     Raises SourceError when no such image exists (coefficients that fold the picture over itself).
     """
@@ -99,12 +97,7 @@ def _source(lens: Lens, K: FloatArray, zoom: float, u: FloatArray, v: FloatArray
 
 
 class Undistorter:
-    """Resamples images of one camera; the map is computed once.
-
-    Arguments:
-        K: [3, 3] of the distorted camera at the size of the images to be resampled.
-        pinhole: [3, 3] of the result, same size.
-    """
+    """Resamples images of one camera from ``K`` [3, 3] to ``pinhole`` [3, 3], same size; the map is computed once."""
 
     def __init__(self, lens: Lens, K: FloatArray, pinhole: FloatArray, size: tuple[int, int]) -> None:
         width, height = size

@@ -53,13 +53,7 @@ def parse_disturbances(text: str) -> tuple[Disturbances, int]:
 
 
 class DisturbedSource(TransformedSource):
-    """A recording under disturbances that its own URI names.
-
-    Arguments:
-        source: the recording itself.
-        disturbances, seed: what is done to it.
-        uri: how the user asked for it, disturbances included.
-    """
+    """A recording under disturbances that its own URI names."""
 
     def __init__(self, source: FrameSource, disturbances: Disturbances, seed: int, uri: str) -> None:
         super().__init__(source, DataOptions(), disturbances, seed)

@@ -34,11 +34,7 @@ def told_apart(path: Path) -> str:
 def read_image(
     path: Path, size: tuple[int, int], target: tuple[int, int], declared: str = "cameras.json declares"
 ) -> FloatArray:
-    """Decode an image and average it down.
-
-    Returns [h, w, 3] float32 in [0, 1]; grey images are repeated over the three channels.
-    Raises SourceError naming the file when it is missing, damaged, of another size, or of an unsupported kind.
-    """
+    """Decode an image, average it down, and return [h, w, 3] float32 in [0, 1]. Raises SourceError naming the file."""
     pixels, full_scale = _decode(path)
     height, width = pixels.shape[:2]
     if (width, height) != size:

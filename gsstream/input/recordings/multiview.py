@@ -26,12 +26,7 @@ COARSE = 1e-3
 
 
 class MultiviewSource:
-    """Frames from image files. Thread-safe: reading keeps no state.
-
-    Arguments:
-        folder: the recording.
-        scale: factor in (0, 1] on width and height; images are area-averaged on reading and intrinsics follow.
-        uri: how the user asked for it; the folder when not given.
+    """Frames from image files, area-averaged to ``scale``. Thread-safe: reading keeps no state.
 
     Raises SourceError at construction for a faulty calibration or missing image files, on reading for a faulty image.
     """

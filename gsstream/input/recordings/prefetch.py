@@ -25,17 +25,9 @@ LARGE_PAIR = 64 << 20
 class Prefetcher:
     """Iterate (training frame, test frame) pairs in the given order, at most ``depth`` pairs ahead of the consumer.
 
-    Memory: ``depth`` pairs plus the one the consumer holds. An error while reading a frame is raised when that frame's
-    turn comes, after all earlier frames were delivered; iteration then ends. It also ends, without an error, where a
-    growing recording does. Use as a context manager, or call
-    ``close``, so that threads end even when the consumer stops early.
-
-    Arguments:
-        source: where frames come from; its ``frame`` must be callable from several threads.
-        indices: which frames, in which order.
-        depth: pairs decoded ahead, at least 1; None: 2, and 1 where the images of one take more than ``LARGE_PAIR``.
-        workers: decoding threads, at least 1.
-        storage: how training images wait, and are delivered.
+    An error while reading a frame is raised when its turn comes; iteration then ends, as it does where a growing
+    recording does. Use as a context manager, or call ``close``, so that threads end. ``depth`` None: 2, and 1 where the
+    images of one pair take more than ``LARGE_PAIR``.
     """
 
     def __init__(

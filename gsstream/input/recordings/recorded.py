@@ -48,16 +48,10 @@ class Recording:
 
 
 class RecordedSource:
-    """Frames of a :class:`Recording`. Thread-safe.
+    """Frames of a :class:`Recording`, area-averaged to ``scale``. Thread-safe.
 
     Cameras with distortion are resampled on reading, to the widest pinhole image without empty corners; ``info`` holds
-    the intrinsics of what ``frame`` delivers.
-
-    Arguments:
-        scale: factor in (0, 1] on width and height; images are area-averaged and intrinsics follow.
-        uri: how the user asked for it.
-
-    Raises SourceError when clips and calibration disagree, or clips among themselves.
+    the intrinsics of what ``frame`` delivers. Raises SourceError when clips and calibration disagree.
     """
 
     def __init__(self, recording: Recording, *, scale: float = 1.0, uri: str) -> None:

@@ -52,9 +52,7 @@ class SyntheticOptions(BaseModel):
 class SyntheticSource:
     """Objects move on known paths among static ones, inside a textured room; all surfaces are finite.
 
-    Which ones, and what happens to them, says the option ``scene`` (:class:`ToyScene`).
-
-    Images are quantised to 8 bits after noise, like a camera's. Thread-safe; the same options give the same bits.
+    Images are quantised to 8 bits after noise. Thread-safe; the same options give the same bits.
     """
 
     def __init__(self, options: SyntheticOptions, *, scale: float = 1.0, uri: str = "synthetic:") -> None:

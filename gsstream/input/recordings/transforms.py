@@ -68,11 +68,7 @@ class ChosenSplit(NamedTuple):
 
 
 def choose_split(options: DataOptions, train: Cameras, test: Cameras) -> ChosenSplit:
-    """Return the training and test cameras, as the options of a recipe ask for.
-
-    Raises SourceError for unknown or repeated ids, a camera on both sides, no training camera left, or a leak in the
-    tuning split.
-    """
+    """Return the training and test cameras that the options ask for. Raises SourceError where they cannot be so."""
     ids = (*train.ids, *test.ids)
     tests = test.ids if options.test_cameras is None else _named("data.test_cameras", options.test_cameras, ids)
     left = tuple(i for i in ids if i not in tests)

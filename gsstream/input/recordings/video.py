@@ -18,16 +18,11 @@ from gsstream.input.recordings.images import shrink
 
 
 class VideoClip:
-    """One video stream. Opening reads all packet headers (no decoding), so that frame numbers are exact.
+    """The first ``frames`` pictures of a video, in the order of display. Opening reads all packet headers.
 
-    Frame n is the n-th picture in the order of display. Reading in order decodes each picture once; other orders seek
-    to the key frame before. Full-range and limited-range colour and the file's matrix are honoured by the decoder;
-    more than 8 bits per channel are kept. Pictures are turned as the file says (phones record upright films lying).
-
-    Arguments:
-        frames: how many of its first pictures are taken; None: all.
-
-    Raises SourceError when the file cannot be read, has no picture stream or no time stamps, or fewer pictures.
+    Reading in order decodes each picture once; other orders seek to the key frame before. Colour range and matrix, more
+    than 8 bits per channel and the rotation that the file states are honoured. Raises SourceError for a file that
+    cannot be read or has no time stamps or fewer pictures.
     """
 
     def __init__(self, path: Path, frames: int | None = None) -> None:

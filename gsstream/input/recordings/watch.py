@@ -41,14 +41,8 @@ _WHOLE = _Plan()
 class WatchSource:
     """Frames of a growing folder in the layout of cameras.json. ``frame`` waits until the frame is there.
 
-    A frame once delivered never changes: a file that is written again later is not read again by the run. On a finished
-    folder, and when nothing is dropped or held, it delivers what :class:`MultiviewSource` does.
-
-    Arguments:
-        folder: holds cameras.json from the start ("frames" may be left out), images come as they are captured.
-        uri: how the user asked for it. ``info.uri`` is the folder: streams name the recording, not how it was followed.
-
-    Raises SourceError at construction for a faulty calibration.
+    A frame once delivered never changes: a file that is written again later is not read again. ``info.uri`` is the
+    folder: streams name the recording, not how it was followed. Raises SourceError for a faulty calibration.
     """
 
     def __init__(self, folder: Path, options: WatchOptions, *, scale: float = 1.0) -> None:

@@ -61,14 +61,9 @@ def fit_copies(
     scene: Gaussians[torch.Tensor], work: FitContext, settings: CopySettings, rng: Rng,
     admitted: CopyFilter | None = None,
 ) -> Gaussians[torch.Tensor]:  # fmt: skip
-    """Return the Gaussians that a frame adds to a scene, raw values.
+    """Return the Gaussians that a frame adds to a scene, raw values, at the places that ``admitted`` lets pass.
 
-    Arguments:
-        scene: N rows, after the frame's motions and without those that leave.
-        work: the frame; copies are made where its gradients reach.
-        settings: their passes are spread over the rounds.
-        rng: random streams by name and frame.
-        admitted: chooses among the places that are found; None: all of them.
+    The scene is that after the frame's motions and without rows that leave; the passes are spread over the rounds.
     """
     added, views, rounds = scene.rows(slice(0, 0)), list(range(len(work.cameras))), settings.rounds
     epochs = work.scaled(settings.epochs)

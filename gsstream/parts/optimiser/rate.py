@@ -24,12 +24,7 @@ def channel_spread(latents: torch.Tensor, step: float | torch.Tensor) -> torch.T
 
 
 def laplace_bits(latents: torch.Tensor, step: float | torch.Tensor, spread: torch.Tensor) -> torch.Tensor:
-    """Return [A, L]: bits of each latent under a Laplace law.
-
-    That is -log2 of the mass of Laplace(0, b) within half a symbol of latents / step.
-
-    Smooth everywhere: flat at zero, linear beyond half a symbol.
-    """
+    """Return [A, L]: bits of each latent, -log2 of the mass of Laplace(0, b) within half a symbol of it."""
     u, half = (latents / step).abs(), 0.5 / spread
     inside = -torch.log1p(-torch.exp(-half) * torch.cosh(u.clamp_max(0.5) / spread))
     outside = u / spread - torch.log(torch.sinh(half))

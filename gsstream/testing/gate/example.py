@@ -14,9 +14,7 @@ from gsstream.api import GateSampler, GateTraits, PartConfig, check_finite
 class ExampleGate(GateSampler):
     """Opens a gate by chance while training: g = 1 where z + n > 0, else 0, with n ~ Logistic(0, 1).
 
-    So P(g = 1) = sigmoid(z).
-
-    The gradient is that of sigmoid((z + n) / temperature), straight through the step.
+    So P(g = 1) = sigmoid(z). The gradient is that of sigmoid((z + n) / temperature), straight through the step.
     """
 
     source = "gsstream"

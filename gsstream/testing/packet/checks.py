@@ -39,13 +39,7 @@ class PacketCodec:
 
 
 def tiny_key(seed: int = 0, number: int = 40, nodes: int = 12) -> KeyState:
-    """Return a scene of 40 Gaussians in 12 nodes.
-
-    Arguments:
-        seed: of its values.
-        number: of Gaussians.
-        nodes: of its layout.
-    """
+    """Return a scene of 40 Gaussians in 12 nodes."""
     rng = np.random.default_rng(seed)
 
     def normal(*shape: int) -> FloatArray:

@@ -31,11 +31,7 @@ def candidates(
 
 
 class VoteCache:
-    """The votes of a frame that were counted so far: a centre that has not moved since keeps its own.
-
-    Arguments:
-        change: of the frame. cameras: its training cameras.
-    """
+    """The votes of a frame that were counted so far: a centre that has not moved since keeps its own."""
 
     def __init__(self, change: Change, cameras: Cameras) -> None:
         self._change, self._cameras = change, cameras

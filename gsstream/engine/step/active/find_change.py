@@ -12,13 +12,7 @@ from gsstream.engine.step.active.change_on_device import change_on_device
 
 
 def find_change(state: StreamState, frame: Frame, images: FrameImages, threshold: float) -> Change | None:
-    """Return the changed tiles of every view, in the processor's memory; None where ``threshold`` is 0.
-
-    Arguments:
-        state: that before the frame, with the images that its scene shows.
-        images: those of the frame.
-        threshold: as :func:`detect_changed_tiles` takes it.
-    """
+    """Return the changed tiles of every view, in the processor's memory; None where ``threshold`` is 0."""
     if threshold == 0 or images.device.type == "cpu":
         return detect_changed_tiles(state.previous, frame, threshold)
     resident = state.resident

@@ -27,8 +27,7 @@ _ASPECT_TOLERANCE = 0.01
 def camera_clips(folder: Path, pattern: str) -> dict[str, Clip]:
     """Return camera id -> clip, in natural order, from the first of these layouts that is there.
 
-    ``NAME.mp4``; ``NAME/images/*.png``; ``NAME/*.png``; ``frame000001/NAME.png`` (one folder per instant).
-    NAME follows ``pattern`` (a glob); PNG or JPEG.
+    ``NAME.mp4``; ``NAME/images/*.png``; ``NAME/*.png``; ``frame000001/NAME.png``. NAME follows ``pattern`` (a glob).
     """
     videos = [p for p in folder.glob(pattern) if p.suffix.lower() in VIDEO_SUFFIXES]
     if videos:

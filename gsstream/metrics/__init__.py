@@ -1,10 +1,10 @@
 """What is measured on decoded frames. Numpy only."""
 
-from gsstream.metrics.flicker import flicker as flicker
 from gsstream.metrics.flip import FLIP_VARIANT as FLIP_VARIANT
 from gsstream.metrics.flip import flip as flip
 from gsstream.metrics.lpips import OnnxLpips as OnnxLpips
 from gsstream.metrics.moving import changed_mask as changed_mask
+from gsstream.metrics.moving import flicker as flicker
 from gsstream.metrics.moving import moving_mask as moving_mask
 from gsstream.metrics.moving import psnr_moving as psnr_moving
 from gsstream.metrics.noise import noise_sigma as noise_sigma

@@ -55,3 +55,19 @@ def dilate(mask: Mask, radius: int) -> Mask:
 def psnr_moving(image: FloatArray, target: FloatArray, first: FloatArray, sigma: float) -> float:
     """Return the PSNR on the moving pixels of ``target``; nan where nothing moves."""
     return psnr(image, target, moving_mask(target, first, sigma))
+
+
+def flicker(
+    image: FloatArray, last_image: FloatArray, truth: FloatArray, last_truth: FloatArray, sigma: float
+) -> float:
+    """Return the mean absolute change of still pixels between two decoded frames, in levels of 8 bits.
+
+    Still are pixels whose ground truth does not differ between the frames beyond the camera's noise (as in
+    ``moving_mask``). Only decoded pictures are subtracted, so 0 means a calm picture, right or wrong; nan: everything
+    moves.
+    """
+    check_pair(image, last_image)
+    check_pair(image, truth)
+    still = ~moving_mask(truth, last_truth, sigma)
+    change = np.abs(np.asarray(image, np.float64) - last_image)[still]
+    return 255 * float(change.mean()) if change.size else math.nan

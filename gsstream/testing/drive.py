@@ -45,7 +45,7 @@ class Behaviour:
 
 def behaviour_of(part: Part) -> Behaviour:
     """Return the behaviour of the part's kind."""
-    found: Behaviour = importlib.import_module(f"gsstream.testing.{kind_of(part)}.behaviour").BEHAVIOUR
+    found: Behaviour = importlib.import_module(f"gsstream.testing.{kind_of(part)}.checks").BEHAVIOUR
     return found
 
 

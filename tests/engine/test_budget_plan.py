@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from gsstream.core import log as log_module
 from gsstream.core.errors import RecipeError
 from gsstream.core.log import FrameLog
-from gsstream.engine.budget.controller import Controller
+from gsstream.engine.budget.controller import Controller, spent
 from gsstream.engine.budget.epoch_scheduler import Allowance, estimated_bytes, next_rate_weight
 from gsstream.engine.budget.plan import (
     MAX_WEIGHT,
@@ -27,7 +27,6 @@ from gsstream.engine.budget.plan import (
     plan,
 )
 from gsstream.engine.budget.report import budget_lines
-from gsstream.engine.budget.usage import spent
 from gsstream.method.base import Step
 from gsstream.packet import encode_empty
 from gsstream.packet.symbols import encode_symbols

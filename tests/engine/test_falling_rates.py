@@ -13,7 +13,7 @@ from flow_runs import WORLD, encode
 from gsstream_cpu_render.adam_part import CpuAdam
 from gsstream_cpu_render.residual import CpuResidualOptimiser
 
-from gsstream.engine.step.lr_factor import lr_factor
+from gsstream.engine.step.optimise import lr_factor
 from gsstream.packet import StreamReader
 from gsstream.parts.optimiser.adam import ReferenceAdam
 from gsstream.parts.optimiser.base import AdamState

@@ -23,9 +23,9 @@ from gsstream.engine.frame0 import refine
 from gsstream.engine.frame0.axes import nearest_axes
 from gsstream.engine.frame0.refine import track_motion
 from gsstream.engine.keys import keyframes
-from gsstream.engine.method.repeating import SkippedWorkWarning
+from gsstream.engine.method.wrapped import SkippedWorkWarning
 from gsstream.engine.run.measure import HeldOut
-from gsstream.engine.state.refinement import Refinement
+from gsstream.engine.state.stream_state import Refinement
 from gsstream.method.base import Step
 from gsstream.packet import PlayerState, quantise_key
 from gsstream.parts.render.activations import rotation_matrices

@@ -15,8 +15,8 @@ from gsstream.cli.main import run_command
 from gsstream.core.errors import ComponentError, GsstreamError, InputError
 from gsstream.engine.assembly import checks as checks_module
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.assembly.call_location import Where
 from gsstream.engine.assembly.checks import Checks, Look, requested_checks
+from gsstream.engine.assembly.fault import Where
 from gsstream.engine.run.recording import open_recording
 from gsstream.engine.run.session import run
 from gsstream.parts.gate.always_open import AlwaysOpen

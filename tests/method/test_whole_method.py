@@ -16,7 +16,7 @@ from gsstream.core.errors import ComponentError, RecipeError
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.method.checked import difference_between
-from gsstream.engine.method.repeating import RepeatedFrameWarning, SkippedWorkWarning
+from gsstream.engine.method.wrapped import RepeatedFrameWarning, SkippedWorkWarning
 from gsstream.engine.run.encoder import Callbacks, Encoder
 from gsstream.input.recordings.open import open_source
 from gsstream.method.base import StreamingMethod

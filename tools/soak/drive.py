@@ -17,7 +17,7 @@ import numpy as np
 
 from gsstream.core.errors import ComponentError, InputError, PluginUnavailable, ShapeError
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.method.repeating import RepeatedFrameWarning, SkippedWorkWarning
+from gsstream.engine.method.wrapped import RepeatedFrameWarning, SkippedWorkWarning
 from gsstream.engine.run.recording import open_recording
 from gsstream.engine.run.session import METRICS, STREAM, RunListener, run
 from gsstream.method.base import Step

@@ -12,7 +12,6 @@ from gsstream.core.changes.delta import row_gates as row_gates
 from gsstream.core.changes.field import Field as Field
 from gsstream.core.changes.field import apply_field as apply_field
 from gsstream.core.changes.field import field_rows as field_rows
-from gsstream.core.changes.groups import Groups as Groups
 from gsstream.core.changes.hashgrid import FieldShape as FieldShape
 from gsstream.core.changes.history import Displacement as Displacement
 from gsstream.core.changes.motion import Motion as Motion
@@ -29,5 +28,6 @@ from gsstream.core.changes.rows import add_as_nodes as add_as_nodes
 from gsstream.core.changes.rows import add_to_nodes as add_to_nodes
 from gsstream.core.changes.rows import apply_row_edit as apply_row_edit
 from gsstream.core.changes.rows import gather_rows as gather_rows
+from gsstream.core.changes.scene import Groups as Groups
 from gsstream.core.changes.scene import Layout as Layout
 from gsstream.core.changes.scene import Scene as Scene

@@ -14,8 +14,7 @@ from typing import Any, Generic, NamedTuple
 
 import numpy as np
 
-from gsstream.core.changes.groups import Groups
-from gsstream.core.changes.scene import Scene
+from gsstream.core.changes.scene import Groups, Scene
 from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import SH0, Array, Gaussians, Other
 from gsstream.core.shapes import FloatArray, IntArray

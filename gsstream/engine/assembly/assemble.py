@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
-from gsstream.core.errors import PluginUnavailable, UnknownName
-from gsstream.core.kinds import METHOD_SLOTS
+from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
+from gsstream.core.kinds import METHOD_SLOTS, PART_KINDS
 from gsstream.core.part import Part, unwrapped
-from gsstream.engine.assembly.call_location import Where
 from gsstream.engine.assembly.checks import Checks, requested_checks
 from gsstream.engine.assembly.choose_renderer import Chosen, choose_renderer, construct
+from gsstream.engine.assembly.fault import Where
 from gsstream.engine.assembly.guard import guard
-from gsstream.engine.assembly.live import with_live
 from gsstream.engine.assembly.recipe_keys import unused_keys
 from gsstream.engine.assembly.title import title
 from gsstream.method.base import StreamingMethod
@@ -35,6 +34,7 @@ from gsstream.recipe.check import join_problems, validate
 from gsstream.recipe.document import KeyPath, Origin
 from gsstream.recipe.load import ResolvedRecipe
 from gsstream.recipe.model import ComponentRef, Recipe
+from gsstream.spec import ComponentSpec
 
 SLOTS = (*METHOD_SLOTS, "streaming_method", "renderer")
 #: Everything that is called behind a guard.
@@ -234,3 +234,26 @@ def _choose(
         problems.append(f"{where}: renderer.params needs a named renderer, but renderer.name is 'auto'")
         return None
     return choose_renderer(catalog, _processor_only(parts))
+
+
+def with_live(resolved: ResolvedRecipe, live: Mapping[str, Part], catalog: Catalog) -> ResolvedRecipe:
+    """Return the recipe with these parts, slot -> part, in place of the ones it names.
+
+    Raises InputError for a part that does not fit its slot.
+    """
+    refs = {slot: _reference(slot, part, catalog) for slot, part in live.items()}
+    origins = {path: origin for path, origin in resolved.origins.items() if path[0] not in refs}
+    origins |= {(slot,): Origin("Python", f"Python: {slot}={ref.name}") for slot, ref in refs.items()}
+    return replace(resolved, recipe=resolved.recipe.model_copy(update=refs), origins=origins)
+
+
+def _reference(slot: str, part: Part, catalog: Catalog) -> ComponentRef:
+    """The name and settings of a live part; one that no plugin declares is called ``module:Class``."""
+    contract: type[Any] = PART_KINDS[slot].contract_class()
+    if not isinstance(part, contract):
+        raise InputError(f"{slot}: expected a live {contract.__name__} or the name of one, got {part!r}")
+    name = target = f"{type(part).__module__}:{type(part).__qualname__}"
+    for (kind, known), entry in catalog.entries.items():
+        if kind == slot and isinstance(entry.spec, ComponentSpec) and entry.spec.target == target:
+            name = known
+    return ComponentRef(name=name, params=part.config.model_dump(mode="json"))

@@ -15,8 +15,7 @@ import torch
 
 from gsstream.core.deferred import require
 from gsstream.core.errors import InputError
-from gsstream.engine.assembly.call_location import Where
-from gsstream.engine.assembly.fault import fault
+from gsstream.engine.assembly.fault import Where, fault
 
 VARIABLE = "GSSTREAM_CHECKS"
 UNIT = (0.0, 1.0)

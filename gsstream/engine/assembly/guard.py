@@ -14,9 +14,8 @@ from typing import Any, TypeVar, cast
 from gsstream.core.deferred import blaming
 from gsstream.core.errors import ComponentError, GsstreamError, InputError, ShapeError
 from gsstream.core.part import unwrapped
-from gsstream.engine.assembly.call_location import Where
 from gsstream.engine.assembly.checks import Checks, Look
-from gsstream.engine.assembly.fault import fault
+from gsstream.engine.assembly.fault import Where, fault
 from gsstream.engine.assembly.output_checks import OUTPUT_CHECKS
 from gsstream.parts.optimiser.base import RowOptimiser
 from gsstream.parts.optimiser.residual import ResidualOptimiser

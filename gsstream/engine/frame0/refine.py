@@ -24,8 +24,7 @@ from gsstream.engine.fit.densify import DensifyStatistics
 from gsstream.engine.frame0.axes import quat_conjugate
 from gsstream.engine.frame0.optimise import CPU, FirstFrameRun
 from gsstream.engine.frame0.pyramid import one_size
-from gsstream.engine.state.refinement import Refinement
-from gsstream.engine.state.stream_state import Step, StreamState
+from gsstream.engine.state.stream_state import Refinement, Step, StreamState
 from gsstream.method.tools import Tools
 from gsstream.packet import PlayerState
 from gsstream.parts.render.activations import quat_multiply_torch, rotation_matrices

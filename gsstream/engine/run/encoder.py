@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
+
+import torch
 
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
@@ -24,7 +27,6 @@ from gsstream.engine.frame0.reproject import to_stream_coordinates
 from gsstream.engine.frame0.reuse import point_cloud_of
 from gsstream.engine.keys.resume import check_stream, read_end, states_since_key
 from gsstream.engine.method.wrapped import wrapped
-from gsstream.engine.run.threads import one_torch_thread
 from gsstream.engine.step.tools import RunTools
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.input.seeds.shell import mean_color
@@ -202,3 +204,18 @@ class Encoder:
             extra={"source_uri": info.uri, "licence": info.licence, "title": self.parts.title, **carried},
             world=info.world,
         )
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Run what is inside with one thread of torch, and restore the number afterwards.
+
+    Torch's share of a frame is elementwise work on few rows: more threads cost more than they give, and spin against
+    the native kernels' own pool. One thread also keeps its sums, and so the bytes, independent of the machine's cores.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

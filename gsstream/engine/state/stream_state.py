@@ -4,19 +4,56 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.engine.state.refinement import Refinement
-from gsstream.engine.state.resident import Resident
+from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.engine.fit.densify import DensifyStatistics
+from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.method.base import Step as MethodStep
 from gsstream.packet import PlayerState
 from gsstream.parts.render.base import RenderSession
 from gsstream.parts.render.exposure import Exposure
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """All Gaussians of a scene in training, which no player has yet. Nothing in it is changed once it is made.
+
+    It follows from the first key packet, the packets since and their pictures, so a resumed run makes it again.
+    """
+
+    gaussians: Gaussians[torch.Tensor]  # [B] rows, raw values
+    levels: torch.Tensor  # [B] int64 octree level of each
+    ancestors: torch.Tensor  # [B] int64 row of the players' scene that each came from; -1: that one is gone
+    #: Attribute -> Adam state of its rows (``RowParameters.moments``); empty before the first iteration.
+    moments: Mapping[str, Mapping[str, torch.Tensor]]
+    statistics: DensifyStatistics  # of the screen gradients since Gaussians were last added
+    iterations: int  # made so far
+
+
+class Resident(NamedTuple):
+    """The decoded scene, its groups and the images that it shows, on the renderer's device."""
+
+    gaussians: Gaussians[torch.Tensor]
+    hierarchy: Hierarchy
+    images: FrameImages
+
+
+def updated(
+    before: Gaussians[torch.Tensor], after: Gaussians[FloatArray], rows: IntArray
+) -> Gaussians[torch.Tensor]:
+    """Return the scene ``after`` on the device of ``before``; only ``rows`` [A], all that differ, are copied to it."""
+    device = before.means.device
+    if device.type == "cpu":
+        return after.map(torch.from_numpy)
+    index = torch.from_numpy(rows).to(device)
+    changed = after.rows(rows).map(lambda value: torch.from_numpy(value).to(device))
+    return Gaussians(**{name: value.index_copy(0, index, getattr(changed, name)) for name, value in before.items()})
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import torch
 
 from gsstream.core.changes import Delta, Scene, sent_rows
 from gsstream.core.gaussians import Gaussians
-from gsstream.engine.state.resident import Resident, updated
+from gsstream.engine.state.stream_state import Resident, updated
 from gsstream.engine.step.context import EngineContext
 from gsstream.packet import PlayerState
 from gsstream.parts.render.base import RenderSession

@@ -17,8 +17,7 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.engine.fit.photometric import PhotometricLoss, render_exposed
 from gsstream.engine.fit.schedule import DSSIM
-from gsstream.engine.state.resident import Resident
-from gsstream.engine.state.stream_state import StreamState
+from gsstream.engine.state.stream_state import Resident, StreamState
 from gsstream.engine.step.active.candidates import VoteCache, changed_rows
 from gsstream.engine.step.active.change import MAX_PIXEL_SIGMA, Change
 from gsstream.input.seeds.shell import in_shell

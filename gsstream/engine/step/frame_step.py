@@ -6,31 +6,38 @@ what changed -> motion -> confidence, gates -> optimise -> growth -> code -> dec
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
-from gsstream.core.changes import Delta
+import torch
+
+from gsstream.core.changes import Delta, apply_delta
 from gsstream.core.deferred import deferred_checks
 from gsstream.core.frame import Frame
+from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.log import FrameLog
+from gsstream.core.rng import Rng
 from gsstream.core.storage import packed
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import Checks
+from gsstream.engine.assembly.guard import error_context
+from gsstream.engine.budget.controller import usage
 from gsstream.engine.budget.epoch_scheduler import scheduled
-from gsstream.engine.budget.usage import usage
 from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.engine.state.next_state import next_state
 from gsstream.engine.state.stream_state import Step, StreamState
-from gsstream.engine.step.active.find_change import find_change
+from gsstream.engine.step.active.candidates import CHANGE_VOTES, candidates
+from gsstream.engine.step.active.change_on_device import find_change
 from gsstream.engine.step.commit import keep
+from gsstream.engine.step.context import EngineContext
 from gsstream.engine.step.encode import encode_frame
-from gsstream.engine.step.growth import with_growth
 from gsstream.engine.step.metrics import log_packet, step_numbers
 from gsstream.engine.step.motion import propose_motion
 from gsstream.engine.step.optimise import optimise
 from gsstream.engine.step.problem import Problem
 from gsstream.engine.step.quantise import quantise_residual
-from gsstream.engine.step.select import select
 from gsstream.method.tools import Tools
 from gsstream.packet import decode_packet, encode_empty
+from gsstream.parts.growth.none import NoGrowth
 from gsstream.parts.update.base import Scope
 
 
@@ -93,3 +100,38 @@ def empty_step(state: StreamState, frame: Frame, log: FrameLog) -> Step:
     log.set(changed_tiles=0.0, **step_numbers(None, 0, None))
     return Step(replace(state, player=player), replace(packet, decoded=player), "empty")
 
+
+def with_growth(parts: Assembly, state: StreamState, delta: Delta, view: EngineContext, rng: Rng) -> Delta:
+    """Return the delta with the rows that leave, of which those of the shell stay, and those that join.
+
+    Raises ComponentError when the part fails, or proposes what does not fit the scene.
+    """
+    if isinstance(parts.part("growth"), NoGrowth):
+        return delta  # the scene after the residual is not needed
+    after = apply_delta(state.player.scene, delta)
+    rows = parts.growth.propose(after, view, rng)
+    with error_context("growth", parts.part("growth"), parts.where):
+        if rows is not None:
+            apply_delta(after, Delta((rows,)))  # before rows are left out: a wrong proposal gets an error
+            rows = replace(rows, removed=rows.removed[~view.shell_rows.cpu().numpy()[rows.removed]])
+    return delta.with_row_edit(rows)
+
+
+class Selected(NamedTuple):
+    """Rows [A] int64, ascending, that take part, and logits [M] of the gates."""
+
+    rows: torch.Tensor
+    logits: torch.Tensor
+
+
+def select(parts: Assembly, view: EngineContext, hierarchy: Hierarchy, scope: Scope) -> Selected:
+    """Return what confidence, propagation and gate choose; none of them is called in a frame without a residual."""
+    if scope is Scope.NONE:
+        nothing = view.gaussians.means.new_zeros(0, dtype=torch.int64)
+        return Selected(nothing, view.gaussians.means.new_zeros(hierarchy.num_nodes))
+    seen = view.everywhere() if scope is Scope.ALL else view
+    confidence = parts.propagation.propagate(parts.confidence.estimate(seen), hierarchy)
+    logits = parts.gate.init(confidence)
+    open_probability = parts.gate.open_probability(logits)
+    able = seen.changed_rows(CHANGE_VOTES)
+    return Selected(candidates(able, open_probability, hierarchy, parts.recipe.stream.active_threshold), logits)

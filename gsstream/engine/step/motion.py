@@ -13,8 +13,7 @@ from gsstream.core.frame import Frame
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import error_context
 from gsstream.engine.fit.frame_images import FrameImages
-from gsstream.engine.state.resident import updated
-from gsstream.engine.state.stream_state import StreamState
+from gsstream.engine.state.stream_state import StreamState, updated
 from gsstream.engine.step.active.change import Change
 from gsstream.engine.step.context import EngineContext
 from gsstream.method.tools import Tools

@@ -6,13 +6,16 @@ An iteration samples the gates, renders a view with the residual behind them, di
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import partial
 
+import numpy as np
 import torch
 
 from gsstream.core.deferred import deferred_checks
 from gsstream.core.picture_size import bit_price_factor
+from gsstream.core.shapes import IntArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.budget.epoch_scheduler import estimated_bytes
@@ -20,13 +23,12 @@ from gsstream.engine.budget.schedule import Schedule
 from gsstream.engine.fit.gates import TrainedGates
 from gsstream.engine.fit.schedule import GATE_LR
 from gsstream.engine.step.active.candidates import keep_mask
-from gsstream.engine.step.dead_gates import count_dead_gates
-from gsstream.engine.step.levels import current_level, level_schedule
-from gsstream.engine.step.lr_factor import lr_factor
 from gsstream.engine.step.problem import Problem, Solution
+from gsstream.parts.gate.base import GateSampler
 from gsstream.parts.optimiser.residual import Iteration, ResidualEpoch
 from gsstream.parts.update.base import init_latents, scale_steps
 from gsstream.parts.update.joint import joint_layout
+from gsstream.recipe.model import Stream
 
 #: Rows leave only when at least a tenth of them can: each time, every view has to be frozen anew.
 MAX_RETAINED_SHARE = 0.9
@@ -135,3 +137,55 @@ class _Fit:
             dead_gates=dead,
             open_gates=self.open_gates,
         )
+
+
+def lr_factor(final: float, iteration: int, iterations: int) -> float:
+    """Return the factor on the learning rates of a frame's residual at an iteration: it falls exponentially from 1."""
+    return math.pow(final, iteration / max(1, iterations - 1))
+
+
+#: Iterations of a level in multiples of those of the level before, N_{i+1} = omega N_i: the paper leaves omega open.
+OMEGA = 1.5
+
+
+def level_schedule(stream: Stream, unit_of: IntArray) -> tuple[tuple[float, int], ...]:
+    """Return pairs (fraction of the frame until which, finest level that takes part) (paper, supplement).
+
+    The H levels are those that hold Gaussians: a structure may have more, of which the finest are often empty, and a
+    schedule over empty levels would delay no row. It starts at level floor(H / 2); each finer level's stage is
+    omega times longer, N_{i+1} = omega N_i. Empty without ``stream.progressive``, or when there is only one stage.
+    The paper leaves omega and the treatment of inactive levels open: here they keep their previous attributes, and
+    their gates start from the confidence when their turn comes.
+    """
+    if not stream.progressive:
+        return ()
+    levels = np.unique(unit_of).tolist()
+    waiting = levels[len(levels) // 2 :]
+    if len(waiting) < 2:
+        return ()
+    weights = [OMEGA**i for i in range(len(waiting))]
+    ends = np.cumsum(weights) / sum(weights)
+    return tuple(zip(ends.tolist(), waiting, strict=True))
+
+
+def current_level(schedule: tuple[tuple[float, int], ...], fraction: float) -> int:
+    """Return the finest level that takes part at this fraction [0, 1) of the frame's iterations."""
+    return next((level for end, level in schedule if fraction < end), schedule[-1][1])
+
+
+#: Spacing of float32 below 1: a smaller gradient changes no gate by a logit's step.
+RESOLUTION = 2.0**-24
+
+
+def count_dead_gates(gate: GateSampler, logits: torch.Tensor) -> int:
+    """Count the gates with these logits [M] that neither the images nor the price can move.
+
+    Of a dead gate the derivatives of the deterministic gate and of the open probability are below RESOLUTION.
+    """
+    leaf = logits.detach().clone().requires_grad_()
+    with torch.enable_grad():
+        outputs = [value for value in (gate.sample(leaf, None), gate.open_probability(leaf)) if value.requires_grad]
+        grads = [torch.autograd.grad(value.sum(), leaf)[0].abs() for value in outputs]
+    if not grads:
+        return 0
+    return int((torch.stack(grads).amax(0) < RESOLUTION).sum())

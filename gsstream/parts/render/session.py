@@ -13,9 +13,8 @@ from gsstream.core.context import RowGradient, ScreenGradient
 from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.parts.render.backward import backward, gradient_of
 from gsstream.parts.render.output import TILE, RenderCache, RenderOutput
-from gsstream.parts.render.structure import weighted_structure_tensor
 from gsstream.parts.render.target import ViewTarget
-from gsstream.parts.render.transforms import curvature_of
+from gsstream.parts.render.transforms import curvature_of, weighted_structure_tensor
 from gsstream.parts.render.wrt import G, LossAndGrad, Wrt, WrtTransforms
 
 

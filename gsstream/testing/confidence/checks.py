@@ -8,8 +8,9 @@ from itertools import pairwise
 import torch
 
 from gsstream.parts.confidence.base import ConfidenceEstimator
-from gsstream.testing.cases import EXTREMES, get_case
+from gsstream.testing.cases import EXTREMES, World, get_case
 from gsstream.testing.compare import at_most, equal, finite
+from gsstream.testing.drive import Behaviour, Outputs, Poison, poisons_of
 from gsstream.testing.registry import check
 
 ENOUGH_AUC = 0.9
@@ -119,3 +120,28 @@ def check_confidence_brightness(part: ConfidenceEstimator) -> None:
     bound = part.claims().brightness
     assert bound is not None
     at_most("mean logit of a scene that is brighter by a fiftieth", got, bound, 1e-4, "float32 of the declared bound")
+
+
+#: A pixel that every camera of the cloud covers.
+SPOT = (10, 10)
+
+
+def outputs(part: ConfidenceEstimator, world: World) -> Outputs:
+    """Return logits per Gaussian."""
+    return {"estimate()": part.estimate(world)}
+
+
+def _in_frame(world: World, value: float) -> None:
+    world.now[1][SPOT] = value
+
+
+def _in_frame_before(world: World, value: float) -> None:
+    world.before[1][SPOT] = value
+
+
+POISONS = (
+    Poison("a pixel of view 1", "view 1", _in_frame),
+    Poison("a pixel of view 1 of the frame before", "view 1", _in_frame_before),
+    *poisons_of(*(f"gaussians.{name}" for name in ("means", "quats", "scales", "opacities", "sh0"))),
+)
+BEHAVIOUR = Behaviour(outputs, POISONS, keeps_precision=False, by_gaussian=True)

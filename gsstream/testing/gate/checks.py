@@ -7,9 +7,9 @@ from itertools import pairwise
 import torch
 
 from gsstream.parts.gate.base import AnalyticGate, GateSampler
-from gsstream.testing.cases import get_case
+from gsstream.testing.cases import World, get_case
 from gsstream.testing.compare import ROUNDING, all_equal, at_most, equal, finite
-from gsstream.testing.drive import draw
+from gsstream.testing.drive import Behaviour, Outputs, draw, poisons_of
 from gsstream.testing.registry import check
 
 DRAWS = 4096
@@ -191,3 +191,20 @@ def check_gate_form(part: GateSampler) -> None:
         equal(f"derivative of {name}", grad, derivative, 2e-6, ROUNDING)
     far = 100 * logits.detach()
     equal("bounds", part.bound(far), far.clamp(-form.bound, form.bound))
+
+
+def outputs(part: GateSampler, world: World) -> Outputs:
+    """Return logits, gates and probabilities; every Gaussian has a gate of its own here."""
+    logits = part.init(world.logits)
+    noise = draw(part, len(world.logits))
+    found = {
+        "init()": logits,
+        "sample(None)": part.sample(logits, None),
+        "open_probability()": part.open_probability(logits),
+        "bound()": part.bound(logits),
+    }
+    return found if noise is None else {**found, "sample(noise)": part.sample(logits, noise.to(logits.device))}
+
+
+#: The noise stays in place when Gaussians are permuted: check_gate_noise_is_data permutes it too.
+BEHAVIOUR = Behaviour(outputs, poisons_of("logits", usual=(12.0, -12.0)), by_gaussian=True, no_order="sample(noise)")

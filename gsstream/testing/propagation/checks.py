@@ -10,6 +10,7 @@ from gsstream.core.hierarchy import Hierarchy, tree_roots
 from gsstream.parts.propagation.base import Propagation
 from gsstream.testing.cases import World, flat, get_case
 from gsstream.testing.compare import ROUNDING, at_most, equal, finite
+from gsstream.testing.drive import Behaviour, Outputs, poisons_of
 from gsstream.testing.registry import check
 
 WORLDS = ("one", "two identical", "coincident", "cloud", "logits of 20", "logits of 100", "huge logits")
@@ -127,3 +128,11 @@ def check_propagation_gradient(part: Propagation) -> None:
     tied = torch.zeros(n, dtype=torch.float64, requires_grad=True)
     (gradient,) = torch.autograd.grad(part.propagate(tied, case.hierarchy).sum(), tied)
     finite("gradient at ties", gradient)
+
+
+def outputs(part: Propagation, world: World) -> Outputs:
+    """Return logits per node."""
+    return {"propagate()": part.propagate(world.logits, world.hierarchy)}
+
+
+BEHAVIOUR = Behaviour(outputs, poisons_of("logits", usual=(12.0, -12.0)))

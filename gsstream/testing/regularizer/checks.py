@@ -12,6 +12,7 @@ from gsstream.core.shapes import check_shape
 from gsstream.parts.regularizer.base import AnalyticPenalty, Regularizer
 from gsstream.testing.cases import World, forest, get_case
 from gsstream.testing.compare import ROUNDING, at_most, equal, finite
+from gsstream.testing.drive import Behaviour, Outputs, poisons_of
 from gsstream.testing.registry import check
 
 #: Of a scene, so that a sum that is added up one by one in float32 would lose digits: a million rows.
@@ -180,3 +181,13 @@ def check_regularizer_form(part: Regularizer) -> None:
     for name, leaf, one, other in zip(("probabilities", "residuals"), leaves, found, stated, strict=True):
         one = torch.zeros_like(leaf) if one is None else one
         equal(f"gradient by {name}", one, other, 2e-6, ROUNDING)
+
+
+def outputs(part: Regularizer, world: World) -> Outputs:
+    """Return every term. Nodes have the same probabilities whatever the order of the Gaussians."""
+    opened = torch.sigmoid(torch.linspace(-2, 2, world.hierarchy.num_nodes).to(world.logits))
+    terms = part.penalty(opened, world.residual, world.hierarchy, len(world.logits))
+    return {f"penalty()[{name!r}]": value for name, value in terms.items()}
+
+
+BEHAVIOUR = Behaviour(outputs, poisons_of("residual"), hands_on=True)

@@ -13,6 +13,7 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.parts.structure.base import Structure
 from gsstream.testing.cases import World, get_case
 from gsstream.testing.compare import finite
+from gsstream.testing.drive import Behaviour, Outputs, poisons_of
 from gsstream.testing.registry import check
 
 WORLDS = ("one", "two identical", "line", "cloud", "far", "tiny", "vast", "thin", "unseen")
@@ -174,3 +175,19 @@ def check_structure_translation(part: Structure) -> None:
         want = want or got
         apart = [row for row, (a, b) in enumerate(zip(got, want, strict=True)) if a != b]
         assert not apart, f"moved by {cells} root cells: {len(apart)} of {len(got)} rows are grouped differently"
+
+
+def outputs(part: Structure, world: World) -> Outputs:
+    """Return anchors and hierarchy."""
+    found: Outputs = {}
+    if len(world.points):
+        anchors = part.seed(world.points, world.cameras)
+        for name in ("positions", "colors", "levels", "cell_sizes", "origin"):
+            found[f"seed().{name}"] = getattr(anchors, name)
+    forest = part.build(world.gaussians, world.anchors)
+    return {**found, "build().node_of": forest.node_of, "build().parent": forest.parent, "build().level": forest.level}
+
+
+POISONS = poisons_of("gaussians.means", "gaussians.quats", "gaussians.scales", "points.xyz", "points.rgb")
+#: Node names may change with the order: check_structure_label_free compares partitions.
+BEHAVIOUR = Behaviour(outputs, POISONS, keeps_precision=False, no_order="build")

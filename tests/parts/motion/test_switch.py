@@ -19,9 +19,8 @@ from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.active.change import detect_changed_tiles
 from gsstream.engine.step.context import EngineContext
 from gsstream.packet import PlayerState
-from gsstream.parts.motion.constant_velocity import Coasting
+from gsstream.parts.motion.constant_velocity import Coasting, loss_change, rotating_views
 from gsstream.parts.motion.groups import pixel_size
-from gsstream.parts.motion.switch import loss_change, rotating_views
 from gsstream.parts.render.wrt import WrtRows
 from gsstream.testing.method_driver import MethodUnderTest
 from gsstream.testing.working import fit_fixture

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsstream.parts.render.structure import MIN_ERROR, weighted_structure_tensor
+from gsstream.parts.render.transforms import MIN_ERROR, weighted_structure_tensor
 
 
 def by_hand(image: np.ndarray, target: np.ndarray) -> np.ndarray:

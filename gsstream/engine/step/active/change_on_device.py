@@ -8,8 +8,11 @@ import torch
 from torch.nn.functional import avg_pool2d, pad
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.frame import Frame
+from gsstream.engine.fit.frame_images import FrameImages
+from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.active.blocks import BLOCK, LEAST_SIGMA, MOST_OF_ROUGHNESS, MOST_SIGMA
-from gsstream.engine.step.active.change import MIN_BLOCKS, Change
+from gsstream.engine.step.active.change import MIN_BLOCKS, Change, detect_changed_tiles
 from gsstream.metrics.noise import MAD_TO_SIGMA
 from gsstream.parts.render.base import TILE
 
@@ -78,3 +81,13 @@ def votes_on_device(change: Change, means: torch.Tensor, cameras: Cameras) -> to
         seen = seen + inside
         hits = hits + (inside & dilated[view][v.long() * columns + u.long()])
     return hits / seen.clamp_min(1)
+
+
+def find_change(state: StreamState, frame: Frame, images: FrameImages, threshold: float) -> Change | None:
+    """Return the changed tiles of every view, in the processor's memory; None where ``threshold`` is 0."""
+    if threshold == 0 or images.device.type == "cpu":
+        return detect_changed_tiles(state.previous, frame, threshold)
+    resident = state.resident
+    before = FrameImages(state.previous.images, images.device) if resident is None else resident.images
+    tiles = [change_on_device(before[view], images[view], threshold) for view in range(len(images))]
+    return Change(torch.stack(tiles).cpu(), frame.cameras.height, frame.cameras.width)

@@ -20,7 +20,7 @@ from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, folder_clip
 from gsstream.input.recordings.distortion import Lens
 from gsstream.input.recordings.poses import from_pixel_centers, from_rotation_vector
 from gsstream.input.recordings.recorded import Recording
-from gsstream.input.recordings.storage import load_storage
+from gsstream.input.recordings.rigs.opencv_yaml import load_storage
 from gsstream.input.recordings.sync import RecordingWarning
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"

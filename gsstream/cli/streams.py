@@ -79,10 +79,7 @@ def play(
 
 
 def stream_file(path: Path) -> Path:
-    """Return the stream file meant by ``path``.
-
-    Raises InputError when there is none, naming what was looked for.
-    """
+    """Return the stream file meant by ``path``. Raises InputError when there is none, naming what was looked for."""
     from gsstream.core.errors import InputError
 
     file = path / "stream.gss" if path.is_dir() else path

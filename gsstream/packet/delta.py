@@ -62,10 +62,7 @@ def _motion_sections(motions: tuple[Motion, ...], known: KnownMotions | None) ->
 def decode_delta(
     data: bytes, scene: Scene, previous_decoders: Mapping[str, FloatArray], *, offset: int = 0
 ) -> Delta:
-    """Decode a complete delta packet.
-
-    Raises PacketError with the byte offset.
-    """
+    """Decode a complete delta packet. Raises PacketError with the byte offset."""
     _, sections = expect(data, offset, PacketKind.DELTA)
     _check_sections(sections, offset)
     motions = decode_motions(sections["motion"], scene) if "motion" in sections else ()

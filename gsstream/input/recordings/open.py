@@ -35,10 +35,7 @@ _KNOWN = (
 
 
 def open_source(uri: str, scale: float = 1.0) -> FrameSource:
-    """Open a recording.
-
-    Raises SourceError for an unknown uri, naming what exists, and for a faulty recording.
-    """
+    """Open a recording. Raises SourceError for an unknown uri, naming what exists, and for a faulty recording."""
     if uri == "demo":
         return MultiviewSource(DEMO_FOLDER, scale=scale, uri=uri)
     scheme, separator, rest = uri.partition(":")

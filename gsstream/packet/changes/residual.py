@@ -46,10 +46,7 @@ def quantise_decoders(decoders: Mapping[str, FloatArray]) -> dict[str, FloatArra
 def encode_residual(
     residual: Residual, layout: Layout, previous_decoders: Mapping[str, FloatArray]
 ) -> list[tuple[str, bytes]]:
-    """Return the sections of a residual, in order.
-
-    Raises ShapeError when the residual does not fit the layout.
-    """
+    """Return the sections of a residual, in order. Raises ShapeError when the residual does not fit the layout."""
     _check_residual(residual, layout)
     sections = [("gates", encode_gates(np.asarray(residual.gates), residual.num_levels))]
     decoders = residual.decoders

@@ -24,10 +24,7 @@ from gsstream.parts.render.session import RenderSession as RenderSession
 
 
 class Renderer(Part):
-    """A differentiable rasteriser.
-
-    What it returns lies on the device of what it is given.
-    """
+    """A differentiable rasteriser. What it returns lies on the device of what it is given."""
 
     @property
     def device(self) -> torch.device:

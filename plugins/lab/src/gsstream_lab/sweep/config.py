@@ -186,10 +186,7 @@ class SceneList(Section):
 
 
 def read_sweep(path: Path, scenes: Path | None = None, split: SplitName | None = None) -> SweepConfig:
-    """Read a sweep's YAML file.
-
-    Raises RecipeError with file and line of every problem.
-    """
+    """Read a sweep's YAML file. Raises RecipeError with file and line of every problem."""
     config = _read(path, SweepConfig)
     if split is not None:
         config = config.model_copy(update={"split": split})

@@ -25,10 +25,10 @@ from gsstream.engine.step.active.change import Change as Change
 from gsstream.engine.step.active.change import count_per_tile as count_per_tile
 from gsstream.engine.step.active.change import detect_changed_tiles as detect_changed_tiles
 from gsstream.engine.step.quantise import gather_rows_or_zero as gather_rows_or_zero
-from gsstream.parts.growth.copies import least_opaque as least_opaque
 from gsstream.parts.growth.copying import CopyFilter as CopyFilter
 from gsstream.parts.growth.copying import CopySettings as CopySettings
 from gsstream.parts.growth.copying import high_gradient_rows as high_gradient_rows
+from gsstream.parts.growth.copying import least_opaque as least_opaque
 from gsstream.parts.growth.copying import replace_with_copies as replace_with_copies
 from gsstream.parts.growth.fitting import concat_gaussians as concat_gaussians
 from gsstream.parts.growth.fitting import fit_added as fit_added

@@ -25,21 +25,9 @@ from gsstream import API_VERSION
 from gsstream.core.kinds import PART_KINDS
 
 __all__ = [
-    "API_VERSION",
-    "ENTRY_POINT_GROUP",
-    "KINDS",
-    "CommandSpec",
-    "ComponentSpec",
-    "Kind",
-    "MethodSpec",
-    "hookimpl",
+    "API_VERSION", "ENTRY_POINT_GROUP", "KINDS", "CommandSpec", "ComponentSpec", "Kind", "MethodSpec", "hookimpl",
     "hookspec",
 ]  # fmt: skip
-
-
-def __dir__() -> list[str]:
-    return __all__
-
 
 ENTRY_POINT_GROUP = "gsstream"
 if TYPE_CHECKING:

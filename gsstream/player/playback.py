@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from typing import Literal
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.changes import Delta
 from gsstream.core.errors import InputError, PacketError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
@@ -120,10 +119,6 @@ class Playback:
     def state_at(self, frame: int) -> Gaussians[FloatArray]:
         """Decode the scene of a frame, from the nearest earlier key packet or the frame last asked for."""
         return self.player_state(frame).gaussians
-
-    def delta_at(self, frame: int) -> Delta | None:
-        """Return what a frame's packet changed; None for key and empty packets."""
-        return self.player_state(frame).delta
 
     def player_state(self, frame: int) -> PlayerState:
         """Return scene, layout, decoders and last delta of a frame.

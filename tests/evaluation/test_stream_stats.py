@@ -58,7 +58,7 @@ def test_paper_estimate_and_plain_codec_of_a_delta(tmp_path):
     path = make_stream(tmp_path / "s.gss")
     stats = stream_stats(path)
     with Playback(path) as playback:
-        delta, scene = playback.delta_at(1).residual, playback.state_at(1)
+        delta, scene = playback.player_state(1).delta.residual, playback.state_at(1)
     opened = int(np.count_nonzero(delta.gates))
     expected = (96 * opened + entropy_by_hand(delta.gates != 0)) / 8
     packet = stats.packets[1]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.topology import TopologyEdit
 from gsstream.engine.fit.schedule import PRUNE_OPACITY
+from gsstream.parts.optimiser.row_parameters import TopologyEdit
 from gsstream.parts.render.activations import activate_opacities, activate_scales, rotation_matrices
 
 SPLIT_SHRINK = 1.6  # 3DGS: both halves of a split Gaussian are 1.6 times smaller

@@ -19,7 +19,6 @@ from gsstream.core.frame import Frame, shrink_frame
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.picture_size import densify_factor, prune_factor
 from gsstream.core.rng import Rng
-from gsstream.core.topology import TopologyEdit
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import VARIABLE, Checks, Look
 from gsstream.engine.fit import schedule
@@ -34,7 +33,7 @@ from gsstream.engine.frame0.pyramid import Pyramid, PyramidLevel, keep_widths, p
 from gsstream.engine.frame0.regularisers import Dropout, choose_regularisers
 from gsstream.engine.frame0.smooth_depth import SmoothDepth
 from gsstream.input.seeds.shell import find_shell
-from gsstream.parts.optimiser.row_parameters import RowParameters
+from gsstream.parts.optimiser.row_parameters import RowParameters, TopologyEdit
 from gsstream.parts.render.activations import logit, rgb_to_sh0
 from gsstream.parts.render.exposure import Exposure
 from gsstream.parts.render.wrt import LossAndGrad, WrtScene

@@ -15,8 +15,7 @@ from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import decoded_anchors, exposure_from_meta
 from gsstream.engine.frame0.refine import SHOWN, advance_refinement, is_refining, start_refinement
-from gsstream.engine.state.next_state import next_state
-from gsstream.engine.state.stream_state import Refinement, StreamState
+from gsstream.engine.state.stream_state import Refinement, StreamState, next_state
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.method.tools import Tools
 from gsstream.packet import PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet

@@ -23,18 +23,16 @@ from gsstream.engine.assembly.guard import error_context
 from gsstream.engine.budget.controller import usage
 from gsstream.engine.budget.epoch_scheduler import scheduled
 from gsstream.engine.fit.frame_images import FrameImages
-from gsstream.engine.state.next_state import next_state
-from gsstream.engine.state.stream_state import Step, StreamState
+from gsstream.engine.state.stream_state import Step, StreamState, next_state
 from gsstream.engine.step.active.candidates import CHANGE_VOTES, candidates
 from gsstream.engine.step.active.change_on_device import find_change
 from gsstream.engine.step.commit import keep
 from gsstream.engine.step.context import EngineContext
-from gsstream.engine.step.encode import encode_frame
 from gsstream.engine.step.metrics import log_packet, step_numbers
 from gsstream.engine.step.motion import propose_motion
 from gsstream.engine.step.optimise import optimise
 from gsstream.engine.step.problem import Problem
-from gsstream.engine.step.quantise import quantise_residual
+from gsstream.engine.step.quantise import encode_frame, quantise_residual
 from gsstream.method.tools import Tools
 from gsstream.packet import decode_packet, encode_empty
 from gsstream.parts.growth.none import NoGrowth

@@ -3,12 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import torch
 
-from gsstream.core.topology import TopologyEdit
 from gsstream.parts.optimiser.state import AdamState, RowSteps
+
+
+@dataclass(frozen=True, slots=True)
+class TopologyEdit:
+    """New row i of N' copies old row ``source[i]`` (int64); where ``fresh[i]`` its optimiser moments start at zero."""
+
+    source: torch.Tensor
+    fresh: torch.Tensor
+
+    @staticmethod
+    def permute(order: torch.Tensor) -> TopologyEdit:
+        """Reorder rows: new row i is old row ``order[i]``."""
+        return TopologyEdit(order, torch.zeros(order.shape[0], dtype=torch.bool))
+
 
 EMPTY: Mapping[str, torch.Tensor] = MappingProxyType({})
 

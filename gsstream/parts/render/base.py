@@ -17,9 +17,9 @@ from gsstream.core.context import ScreenGradient
 from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.part import Part
-from gsstream.parts.render.output import TILE as TILE
-from gsstream.parts.render.output import RenderCache as RenderCache
-from gsstream.parts.render.output import RenderOutput as RenderOutput
+from gsstream.parts.render.session import TILE as TILE
+from gsstream.parts.render.session import RenderCache as RenderCache
+from gsstream.parts.render.session import RenderOutput as RenderOutput
 from gsstream.parts.render.session import RenderSession as RenderSession
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gsstream.method.base import Step
-from gsstream.parts.growth.copies import Copies
+from gsstream.parts.growth.copying import Copies
 from gsstream.parts.update.none import NoUpdate
 from gsstream.testing.method_driver import MethodUnderTest
 

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from gsstream.core.errors import OutputError
+from gsstream.engine.run.output import run_lock
 from gsstream.evaluation.records import mean, mean_of_views
 from gsstream_lab.jobs.base import Executor, Finished
-from gsstream_lab.jobs.folder import only_one, recording_uri
+from gsstream_lab.jobs.folder import recording_uri
 from gsstream_lab.jobs.schedule import finished_tasks
 from gsstream_lab.sweep.job import Job, Outcome
 from gsstream_lab.sweep.plan import Cell, FirstFrameRun, Plan
@@ -46,7 +47,7 @@ def run_sweep(
             folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"the output folder {out} cannot be used: {error}") from error
-    with only_one(out, "sweep"):
+    with run_lock(out, "sweep"):
         shutil.rmtree(out / WORK, ignore_errors=True)
         (out / WORK).mkdir()
         try:

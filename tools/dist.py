@@ -49,18 +49,7 @@ def for_aarch64() -> dict[str, str]:
 
 
 def build(out: Path, chosen: Sequence[Path], *, isolated: bool = True, aarch64: bool = False) -> dict[str, str]:
-    """Build distributions into a folder.
-
-    Arguments:
-        out: new or empty.
-        chosen: folders of distributions.
-        isolated: each is built in an environment of its own.
-        aarch64: the renderer's wheel for aarch64 is built, too.
-
-    Returns file name -> SHA-256 of all that was built; ``out`` has them as ``SHA256SUMS`` too.
-
-    Raises FileExistsError when ``out`` is not empty, subprocess.CalledProcessError when a build fails.
-    """
+    """Build distributions into ``out``, new or empty; return file name -> SHA-256 (also in ``SHA256SUMS``)."""
     out.mkdir(parents=True, exist_ok=True)
     if any(out.iterdir()):
         raise FileExistsError(f"{out} is not empty: expected a new folder, so that no archive of before stays in it")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import math
@@ -72,7 +73,7 @@ class World:
         if key not in _GRADIENTS:
             # Many checks ask for the same gradient of the same world; the renderer is a pure function.
             _GRADIENTS[key] = RENDERER.screen_gradient(self.gaussians, rig, 0, upstream)
-        return _copy(_GRADIENTS[key])  # type: ignore[no-any-return]
+        return ScreenGradient(*(value.clone() for value in _GRADIENTS[key]))
 
     def screen_gradient_rows(self, view: int, image_gradient: torch.Tensor) -> RowGradient:
         gradient, visible = self.screen_gradient(view, image_gradient)
@@ -268,23 +269,7 @@ def _made(name: str) -> World:
 
 def get_case(name: str) -> World:
     """Return a fresh copy of a named world, so that a part that spoils its inputs does not spoil another's."""
-    fresh: World = _copy(_made(name))
-    return fresh
-
-
-def _copy(value: Any) -> Any:
-    if isinstance(value, torch.Tensor):
-        return value.clone()
-    if isinstance(value, np.ndarray):
-        return value.copy()
-    if isinstance(value, ScreenGradient):
-        return ScreenGradient(*map(_copy, value))
-    if isinstance(value, tuple):
-        return tuple(_copy(item) for item in value)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        changes = {f.name: _copy(getattr(value, f.name)) for f in dataclasses.fields(value)}
-        return replace(value, **changes)
-    return value
+    return copy.deepcopy(_made(name))
 
 
 def fingerprint(value: Any) -> list[bytes]:

@@ -44,12 +44,9 @@ CHECKS: dict[str, Check] = {}
 
 
 def check(kind: str, trait: str | None = None, kinds: tuple[str, ...] | None = None) -> Callable[..., Any]:
-    """Register a function ``check_*(subject)``.
+    """Register a function ``check_*(subject)`` of a kind, for parts that claim a ``trait`` (None: all).
 
-    Arguments:
-        kind: of the report it stands in.
-        trait: that a part must claim; None: every part.
-        kinds: of part it is made on; None: ``kind`` alone.
+    ``kinds``: of part it is made on; None: ``kind`` alone.
     """
 
     def register(function: CheckFunction) -> CheckFunction:

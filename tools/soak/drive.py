@@ -33,26 +33,17 @@ Status = Literal["ok", "refused", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a case came to.
+    """What a case came to."""
 
-    Arguments:
-        status: ok; refused: recipe and recording do not go together, and a message says so before anything is encoded;
-            failed: anything else.
-        problem: message of the refusal; of a failure what went wrong, with its traceback.
-        frames: frames encoded, played and compared.
-        gaussians: in the last scene.
-        kinds: packet kind -> number.
-        bytes: size of the stream.
-        seconds: wall time.
-    """
-
+    #: Ok; refused: recipe and recording do not go together, and a message says so before anything is encoded; failed:
+    #: anything else.
     status: Status
-    problem: str = ""
-    frames: int = 0
-    gaussians: int = 0
-    kinds: dict[str, int] | None = None
-    bytes: int = 0
-    seconds: float = 0.0
+    problem: str = ""  # message of the refusal; of a failure what went wrong, with its traceback
+    frames: int = 0  # frames encoded, played and compared
+    gaussians: int = 0  # in the last scene
+    kinds: dict[str, int] | None = None  # packet kind -> number
+    bytes: int = 0  # size of the stream
+    seconds: float = 0.0  # wall time
 
     def record(self) -> dict[str, Any]:
         """As plain JSON values."""

@@ -28,21 +28,13 @@ GRID = 24
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """What moves in one camera, M pixels over all steps from a frame to the next.
+    """What moves in one camera, M pixels over all steps from a frame to the next."""
 
-    Arguments:
-        steps: number of steps.
-        step: [M] in which step.
-        place: [M, 2] centre of the pixel.
-        strength: [M] change.
-        pixels: of one picture.
-    """
-
-    steps: int
-    step: IntArray
-    place: FloatArray
-    strength: FloatArray
-    pixels: int
+    steps: int  # number of steps
+    step: IntArray  # [M] in which step
+    place: FloatArray  # [M, 2] centre of the pixel
+    strength: FloatArray  # [M] change
+    pixels: int  # of one picture
 
     @property
     def share(self) -> float:

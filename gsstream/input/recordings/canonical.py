@@ -38,10 +38,6 @@ class CanonicalSource:
     """A frame source over another one: the same images, with cameras and points in the coordinates of a world.
 
     ``info.world`` leads back. Thread-safe when the inner source is.
-
-    Arguments:
-        source: an open recording, in the coordinates of its files.
-        world: :func:`recording_similarity` it, or of the recording that it shows a part of.
     """
 
     def __init__(self, source: FrameSource, world: World) -> None:

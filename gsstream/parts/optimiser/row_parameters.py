@@ -41,12 +41,7 @@ class RowParameters:
         return self.leaves[name]
 
     def step(self, gradients: Mapping[str, torch.Tensor] = EMPTY, lr_factor: float = 1.0) -> None:
-        """Make one Adam step from ``gradients`` plus the ``.grad`` of the leaves, which is then cleared.
-
-        Arguments:
-            gradients: name -> gradient, like its leaf; leaves without one are not moved.
-            lr_factor: on all learning rates in this step.
-        """
+        """Make one Adam step from ``gradients`` plus the ``.grad`` of the leaves, which is then cleared."""
         total = dict(gradients)
         for name, leaf in self.leaves.items():
             if leaf.grad is not None:

@@ -120,7 +120,7 @@ def check_cheap_spec(part: Part | SourceUnderTest) -> None:
     if not owners:
         raise Skip(f"no installed plugin declares {target}")
     module = _plugin_module(owners[0])
-    heavy = _imports_torch(module, os.pathsep.join(filter(None, sys.path)))
+    heavy = imports_torch(module)
     assert not heavy, f"importing {module}, which declares {cls.__name__}, imports torch: {heavy}"
 
 
@@ -129,6 +129,11 @@ def _plugin_module(plugin: str) -> str:
 
     points = [point for point in entry_points(group="gsstream") if point.name == plugin]
     return points[0].module if points else "gsstream.plugins.builtin"
+
+
+def imports_torch(module: str) -> str:
+    """Say why a process of its own could not import a module without torch; empty when it could."""
+    return _imports_torch(module, os.pathsep.join(filter(None, sys.path)))
 
 
 @functools.cache

@@ -16,23 +16,15 @@ MASK_TILE = 16
 
 
 class SplatArrays(NamedTuple):
-    """Raw parameters of N Gaussians: float32, C-contiguous.
+    """Raw parameters of N Gaussians: float32, C-contiguous."""
 
-    Arguments:
-        means: [N, 3] scene units.
-        quats: [N, 4] wxyz, any norm between 1e-10 and 1e10.
-        scales: [N, 3] natural log of the standard deviations; kept within about +-20.8 (factor 2^30) by the kernels.
-        opacities: [N] logits.
-        sh0: [N, 1, 3] degree-0 coefficients.
-        shN: [N, K-1, 3] higher coefficients, K in {1, 4, 9, 16}.
-    """
-
-    means: Float32
-    quats: Float32
+    means: Float32  # [N, 3] scene units
+    quats: Float32  # [N, 4] wxyz, any norm between 1e-10 and 1e10
+    #: [N, 3] natural log of the standard deviations; kept within about +-20.8 (factor 2^30) by the kernels.
     scales: Float32
-    opacities: Float32
-    sh0: Float32
-    shN: Float32
+    opacities: Float32  # [N] logits
+    sh0: Float32  # [N, 1, 3] degree-0 coefficients
+    shN: Float32  # [N, K-1, 3] higher coefficients, K in {1, 4, 9, 16}
 
 
 class SplatGradients(NamedTuple):

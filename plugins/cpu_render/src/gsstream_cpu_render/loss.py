@@ -35,16 +35,14 @@ class PreparedImage:
 
     Statistics are made strip by strip where they are first needed, for the rows that change are seen in few tiles.
 
-    Arguments:
-        image: [H, W, 3] float32, or uint8 of which 255 is 1.0 (the same bits as its float32); it must not change while
-            this is in use.
-        compact: keep mean and root of the variance of each window as 16-bit codes, in half the memory, where the image
-            lies in [0, 1]. A code is off by at most 1/131,070 of the mean and half of that of the root.
-
     Raises ShapeError for a wrong shape or dtype and for a value that is not finite.
     """
 
+    #: [H, W, 3] float32, or uint8 of which 255 is 1.0 (the same bits as its float32); it must not change while this
+    #: is in use.
     image: Float32 | NDArray[np.uint8]
+    #: Keep mean and root of the variance of each window as 16-bit codes, in half the memory, where the image lies in
+    #: [0, 1]. A code is off by at most 1/131,070 of the mean and half of that of the root.
     compact: bool = False
     #: Mean and variance of the windows by tile [rows, columns, 2, 16, 48], as float32 or as codes, and in which strips
     #: of tiles they are known (1) already.

@@ -32,21 +32,13 @@ DECLINE = "or render on the processor: --renderer cpu"
 
 @dataclass(frozen=True, slots=True)
 class Kernels:
-    """Functions with the signatures of gsplat 1.5: one image at a time, not packed.
+    """Functions with the signatures of gsplat 1.5: one image at a time, not packed."""
 
-    Arguments:
-        project: ``gsplat.fully_fused_projection``.
-        harmonics: ``gsplat.spherical_harmonics``.
-        tiles: ``gsplat.isect_tiles``.
-        offsets: ``gsplat.isect_offset_encode``.
-        rasterize: ``gsplat.rasterize_to_pixels``.
-    """
-
-    project: Callable[..., Any]
-    harmonics: Callable[..., Any]
-    tiles: Callable[..., Any]
-    offsets: Callable[..., Any]
-    rasterize: Callable[..., Any]
+    project: Callable[..., Any]  # ``gsplat.fully_fused_projection``
+    harmonics: Callable[..., Any]  # ``gsplat.spherical_harmonics``
+    tiles: Callable[..., Any]  # ``gsplat.isect_tiles``
+    offsets: Callable[..., Any]  # ``gsplat.isect_offset_encode``
+    rasterize: Callable[..., Any]  # ``gsplat.rasterize_to_pixels``
 
 
 @functools.cache

@@ -16,21 +16,15 @@ FAR = 1e10
 
 @dataclass(frozen=True, slots=True)
 class Projected:
-    """Gaussians as one camera sees them, on the device.
+    """Gaussians as one camera sees them, on the device."""
 
-    Arguments:
-        visible: [N] bool, it touches the image; of all others gsplat leaves the rest undefined.
-        means2d: [N, 2] pixels. depths: [N]. conics: [N, 3]. colors: [N, 3]. opacities: [N].
-        radii: [N, 2] int32, half the sides of the box in which it is drawn, pixels.
-    """
-
-    visible: torch.Tensor
-    means2d: torch.Tensor
-    depths: torch.Tensor
-    conics: torch.Tensor
-    colors: torch.Tensor
-    opacities: torch.Tensor
-    radii: torch.Tensor
+    visible: torch.Tensor  # [N] bool, it touches the image; of all others gsplat leaves the rest undefined
+    means2d: torch.Tensor  # [N, 2] pixels
+    depths: torch.Tensor  # [N]
+    conics: torch.Tensor  # [N, 3]
+    colors: torch.Tensor  # [N, 3]
+    opacities: torch.Tensor  # [N]
+    radii: torch.Tensor  # [N, 2] int32, half the sides of the box in which it is drawn, pixels
 
     def rows(self, index: torch.Tensor) -> Projected:
         """Return some of them."""

@@ -15,23 +15,16 @@ from gsstream_queen.trainable import NewRows, OldRows, Solution, concat
 
 @dataclass(frozen=True)
 class Problem:
-    """What a frame's optimisation is given.
+    """What a frame's optimisation is given."""
 
-    Arguments:
-        work: the frame, opened on the decoded scene before it.
-        active: [A] int64 rows that are trained, ascending.
-        dynamic: [N] bool, who changed. masks: per view changed tiles, None without masking.
-        logits: [A] gates. weights: what is learned of each decoder.
-    """
-
-    work: FrameTools
+    work: FrameTools  # the frame, opened on the decoded scene before it
     renderer: Renderer
     background: tuple[float, float, float]
-    active: torch.Tensor
-    dynamic: torch.Tensor
-    masks: list[torch.Tensor] | None
-    logits: torch.Tensor
-    weights: dict[str, torch.Tensor]
+    active: torch.Tensor  # [A] int64 rows that are trained, ascending
+    dynamic: torch.Tensor  # [N] bool, who changed
+    masks: list[torch.Tensor] | None  # per view changed tiles, None without masking
+    logits: torch.Tensor  # [A] gates
+    weights: dict[str, torch.Tensor]  # what is learned of each decoder
     epochs: int
 
 

@@ -32,12 +32,7 @@ class Points:
 
 
 def synthetic_points(count: int, seed: int) -> Points:
-    """Return points on the walls of a room, on a dozen bodies in it, and on a far shell.
-
-    Surfaces depend on the seed alone.
-
-    The bodies stand beside and behind the object, so that the cameras of :func:`arc_rig` see it.
-    """
+    """Return points on the walls of a room, on a dozen bodies beside and behind the object, and on a far shell."""
     rng = Rng(seed).numpy("bench points")
     centers = rng.uniform([-2.2, -1.3, -0.2], [2.2, 1.3, 2.6], (12, 3))
     centers[np.linalg.norm(centers, axis=1) < 1] *= [2, 1, 1]

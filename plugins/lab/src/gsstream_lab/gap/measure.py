@@ -101,11 +101,9 @@ def measure_gap(
     stream: Path, fresh: Mapping[int, Path], source: FrameSource, epochs: int, *,
     renderer: PlayerRenderer | None = None, progress: Callable[[int, int], None] | None = None,
 ) -> Gap:  # fmt: skip
-    """Render frames of a stream and their fresh reconstructions for the test cameras, and compare with the recording.
+    """Render frames of a stream and of their fresh reconstructions for the test cameras, and compare them.
 
     Moving and changed pixels are those against the stream's first frame; noise is measured between its first two.
-
-    Raises InputError when the recording has no test cameras.
     """
     renderer = find_renderer() if renderer is None else renderer
     cameras = source.info.test.ids

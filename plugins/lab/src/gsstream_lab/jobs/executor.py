@@ -23,14 +23,8 @@ from gsstream_lab.jobs.base import Executor, Finished, Work, thread_environment
 class LocalExecutor:
     """A fresh process for each job: peak memory is the cell's own, and nothing leaks between cells.
 
-    Where the system can, processes come from a fork server: a process that has imported ``preload`` once, has no
-    threads, and is copied for each job, which saves seconds of imports. Elsewhere they are spawned.
-
-    Arguments:
-        workers: jobs at a time.
-        threads: threads of each.
-        work: what a process does with a job (a function that can be imported).
-        preload: modules that all jobs need.
+    Where the system can, processes are copied from a fork server that has imported ``preload`` once and has no threads,
+    which saves seconds of imports. Elsewhere they are spawned.
     """
 
     def __init__(self, workers: int, threads: int, work: Work, preload: Sequence[str] = ()) -> None:

@@ -18,13 +18,8 @@ _PASSED_ON = ("GSSTREAM_LOAD_PLUGINS", "GSSTREAM_ISA")
 class RayExecutor:
     """Ray tasks, one worker process for each job (``max_calls=1``); Ray itself repeats nothing, the sweep does.
 
-    Arguments:
-        address: of a running cluster ("HOST:PORT", "ray://HOST:PORT", "auto"), or "local" to start one here.
-        workers: jobs at a time; default: what the cluster's processors allow.
-        threads: threads, and processors claimed, of each job.
-        work: what a worker does with a job.
-
-    Raises PluginUnavailable without Ray, InputError when there is no cluster at ``address``.
+    ``address``: of a running cluster ("HOST:PORT", "ray://HOST:PORT", "auto"), or "local" to start one here. Raises
+    PluginUnavailable without Ray, InputError when there is no cluster at ``address``.
     """
 
     def __init__(self, address: str, workers: int | None, threads: int, work: Work) -> None:

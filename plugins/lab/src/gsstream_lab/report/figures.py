@@ -86,11 +86,7 @@ def _look(place: int) -> tuple[str, str]:
 
 
 def floor_of(values: Sequence[float]) -> float:
-    """Return where an axis of qualities starts.
-
-    It is the least value, or a little below the better three quarters of them when that alone would take up most of the
-    height.
-    """
+    """Return where an axis of qualities starts: the least value, or a little below the better three quarters."""
     best, least = max(values), min(values)
     quarter = statistics.quantiles(values, n=4, method="inclusive")[0] if len(values) > 3 else least
     low = best - 2 * (best - quarter)

@@ -119,12 +119,7 @@ def _first_seconds(row: Mapping[str, Any], table: TableData) -> float | None:
 
 
 def waited(groups: Sequence[Group]) -> bool:
-    """Say whether the runs waited for the processor.
-
-    Then the wall time of frames is beyond 1.5 times what their threads account for.
-
-    Then seconds say more about the other programs than about the recipes.
-    """
+    """Say whether the runs waited for the processor: frames took over 1.5 times what their threads account for."""
     shares = []
     for run in (run for group in groups for run in group.runs):
         cpu, threads = run.values["cpu_seconds"], float(run.row.get("threads") or math.nan)

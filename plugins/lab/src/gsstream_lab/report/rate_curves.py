@@ -49,11 +49,7 @@ def curves_over(groups: Sequence[Group]) -> dict[str, list[Curve]]:
 
 
 def bd_rate(anchor: Sequence[tuple[float, float]], other: Sequence[tuple[float, float]]) -> float:
-    """Return by how many percent ``other`` needs more bytes than ``anchor`` at equal quality; below 0 it needs fewer.
-
-    Returns:
-        Percent; nan when a curve has fewer than three points, or no quality is reached by both.
-    """
+    """Return by how many percent ``other`` needs more bytes than ``anchor`` at equal quality; nan: cannot be said."""
     from bjontegaard import bd_rate as library
 
     known = all(len(curve) >= MIN_POINTS and curve[0][0] > 0 for curve in (anchor, other))

@@ -12,12 +12,7 @@ from gsstream_lab.sweep.config import SweepConfig, Variant, flat_settings, read_
 
 
 def with_bases(config: SweepConfig, folder: Path) -> SweepConfig:
-    """Replace every ``base`` of a sweep's variants by what it stands for.
-
-    Raises:
-        RecipeError: a file that cannot be read, bases that go in a circle, a base with axes of its own.
-        UnknownName: the file has no such variant.
-    """
+    """Replace every ``base`` of a sweep's variants by what it stands for. Raises RecipeError or UnknownName."""
     return config.model_copy(update={"variants": [_resolved(variant, folder, ()) for variant in config.variants]})
 
 

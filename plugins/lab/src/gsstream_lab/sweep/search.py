@@ -75,14 +75,7 @@ def value_of(resolved: ResolvedRecipe, key: str) -> Any:
 class SweepScore:
     """Compares values by the mean PSNR of decoded frames, on training cameras that are left out.
 
-    Arguments:
-        scene: recording and number of frames; one frame compares the first, more compare those after it.
-        method: its name.
-        seed: of all runs.
-        out: folder of the table.
-        find_method: name -> recipe file.
-        executor: makes the workers of one sweep.
-        say: told one line at a time.
+    One frame compares the first, more compare those after it.
     """
 
     def __init__(

@@ -86,17 +86,25 @@ def read_calibration(folder: Path, *, growing: bool = False, any_sizes: bool = F
     )
 
 
-def _load_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the object of a JSON file; empty for any other value. Raises SourceError for what cannot be read."""
+    data = _parse_json(path)
+    return data if isinstance(data, dict) else {}
+
+
+def _parse_json(path: Path, absent: str = "") -> Any:
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise SourceError(
-            f"{path}: no such file; a recording folder holds {CALIBRATION_FILE} (schema {SCHEMA!r}) beside its images"
-        ) from error
+        return json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, numbers of thousands of digits, deep nesting
         raise SourceError(f"{path}: not valid JSON: {error}") from error
     except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error}") from error
+        told = absent if absent and isinstance(error, FileNotFoundError) else f"cannot be read: {error}"
+        raise SourceError(f"{path}: {told}") from error
+
+
+def _load_json(path: Path) -> dict[str, Any]:
+    absent = f"no such file; a recording folder holds {CALIBRATION_FILE} (schema {SCHEMA!r}) beside its images"
+    data = _parse_json(path, absent)
     # A file without a schema is taken for one of this: what it holds is checked key by key.
     if not isinstance(data, dict) or data.get("schema", SCHEMA) != SCHEMA or "cameras" not in data:
         raise SourceError(

@@ -18,13 +18,32 @@ from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, images_in, natural_sort_key
 from gsstream.input.recordings.poses import from_llff
+from gsstream.input.recordings.recorded import Recording
 
 POSES_FILE = "poses_bounds.npy"
 #: Pictures may be scaled, not cropped or squeezed.
 _ASPECT_TOLERANCE = 0.01
 
 
-def camera_clips(folder: Path, pattern: str) -> dict[str, Clip]:
+def looks_like_llff(folder: Path, pattern: str) -> bool:
+    """Say whether there is a poses_bounds.npy beside videos, folders or pictures of instants called so (a glob)."""
+    return (folder / POSES_FILE).is_file() and any(
+        any(folder.glob(named)) for named in (pattern, f"frame*1/{pattern}")
+    )
+
+
+def read_llff(folder: Path, pattern: str) -> Recording:
+    """Read a recording whose cameras are called so; the first of them is for tests."""
+    clips = _camera_clips(folder, pattern)
+    names = tuple(clips)
+    rig = read_poses_bounds(folder / POSES_FILE, names, clips[names[0]].size)
+    return Recording(
+        name=folder.resolve().name, where=str(folder / POSES_FILE), rig=rig, clips=clips, test=names[:1],
+        licence="see the data set",
+    )  # fmt: skip
+
+
+def _camera_clips(folder: Path, pattern: str) -> dict[str, Clip]:
     """Return camera id -> clip, in natural order, from the first of these layouts that is there.
 
     ``NAME.mp4``; ``NAME/images/*.png``; ``NAME/*.png``; ``frame000001/NAME.png``. NAME follows ``pattern`` (a glob).

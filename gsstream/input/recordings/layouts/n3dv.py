@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from gsstream.input.recordings.layouts.llff import POSES_FILE, camera_clips, read_poses_bounds
+from gsstream.input.recordings.layouts.llff import looks_like_llff, read_llff
 from gsstream.input.recordings.pointfiles import read_ply_points
 from gsstream.input.recordings.recorded import Recording, SeenPoints
 
@@ -17,16 +18,12 @@ PATTERN = "cam[0-9]*"
 
 def looks_like(folder: Path) -> bool:
     """Say whether there is a poses_bounds.npy beside cam00.mp4, cam00/ or frame000001/cam00.png."""
-    return (folder / POSES_FILE).is_file() and any(
-        any(folder.glob(pattern)) for pattern in (PATTERN, f"frame*1/{PATTERN}")
-    )
+    return looks_like_llff(folder, PATTERN)
 
 
 def read(folder: Path) -> Recording:
     """Read N3DV: 18 to 21 cameras, 2704 x 2028, 30 frames per second; cam00 is for tests (paper and released code)."""
-    clips = camera_clips(folder, PATTERN)
-    names = tuple(clips)
-    rig = read_poses_bounds(folder / POSES_FILE, names, clips[names[0]].size)
+    recording = read_llff(folder, PATTERN)
 
     def points() -> SeenPoints | None:
         found = [folder / name for name in POINTS_FILES if (folder / name).is_file()]
@@ -34,14 +31,6 @@ def read(folder: Path) -> Recording:
             return None
         cloud = read_ply_points(found[0])
         # Made from the pictures of all cameras, the test camera's among them: only a leak lets it in.
-        return SeenPoints(cloud, np.ones((len(cloud), len(names)), bool))
+        return SeenPoints(cloud, np.ones((len(cloud), len(recording.rig)), bool))
 
-    return Recording(
-        name=folder.resolve().name,
-        where=str(folder / POSES_FILE),
-        rig=rig,
-        clips=clips,
-        test=names[:1],
-        points=points,
-        licence="see the data set",
-    )
+    return replace(recording, points=points)

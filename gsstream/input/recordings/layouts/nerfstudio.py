@@ -14,7 +14,6 @@ from all images.
 
 from __future__ import annotations
 
-import json
 import math
 import warnings
 from pathlib import Path, PurePosixPath
@@ -25,6 +24,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
+from gsstream.input.recordings.calibration import read_json
 from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip
 from gsstream.input.recordings.distortion import Lens
 from gsstream.input.recordings.layouts.nerfstudio_groups import group_entries
@@ -85,13 +85,7 @@ def read(folder: Path, missing: Missing = "skip") -> Recording:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error}") from error
-    except ValueError as error:
-        raise SourceError(f"{path}: not valid JSON: {error}") from error
-    known: dict[str, Any] = data if isinstance(data, dict) else {}
+    known = read_json(path)
     frames = known.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         raise SourceError(f"{path}: 'frames' must be a non-empty list of objects")

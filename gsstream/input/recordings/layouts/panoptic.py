@@ -8,7 +8,6 @@ image corner, as that project's renderer does. World units are about metres. Pic
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import PointCloud
+from gsstream.input.recordings.calibration import read_json
 from gsstream.input.recordings.clips import Clip, ImageClip
 from gsstream.input.recordings.recorded import Recording, SeenPoints
 
@@ -66,13 +66,7 @@ def read(folder: Path) -> Recording:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    try:
-        meta = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error}") from error
-    except ValueError as error:
-        raise SourceError(f"{path}: not valid JSON: {error}") from error
-    known = meta if isinstance(meta, dict) else {}
+    known = read_json(path)
     if missing := [key for key in ("w", "h", "k", "w2c", "fn", "cam_id") if key not in known]:
         raise SourceError(f"{path}: expected the keys w, h, k, w2c, fn, cam_id; missing: {', '.join(missing)}")
     return known

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.changes.motion import quat_multiply
 from gsstream.core.errors import ShapeError
 from gsstream.core.frame import PointCloud
 from gsstream.core.gaussians import Gaussians
@@ -108,14 +109,9 @@ class World:
         """Return Gaussians of the stream in the recording's coordinates, float64; view-dependent colours turn, too."""
         if self.is_identity:
             return scene
-        w, x, y, z = _quaternion(self.matrix)
-        w1, x1, y1, z1 = np.asarray(scene.quats, np.float64).T
-        quats = np.stack([
-            w * w1 - x * x1 - y * y1 - z * z1, w * x1 + x * w1 + y * z1 - z * y1,
-            w * y1 - x * z1 + y * w1 + z * x1, w * z1 + x * y1 - y * x1 + z * w1,
-        ], 1)  # fmt: skip
         return Gaussians(
-            means=self.points(scene.means), quats=quats,
+            means=self.points(scene.means),
+            quats=quat_multiply(_quaternion(self.matrix)[None], np.asarray(scene.quats, np.float64)),
             scales=np.asarray(scene.scales, np.float64) + np.log(self.scale),
             opacities=scene.opacities, sh0=scene.sh0, shN=rotate_sh(scene.shN, self.matrix),
         )  # fmt: skip
@@ -202,8 +198,8 @@ def _world(rotation: FloatArray, offset: FloatArray, scale: float) -> World:
     return World(tuple(rotation.reshape(-1).tolist()), tuple(offset.tolist()), float(scale))
 
 
-def _quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
-    """wxyz of a rotation, by the largest of its four components (Shepperd)."""
+def _quaternion(rotation: FloatArray) -> FloatArray:
+    """[4] wxyz of a rotation, by the largest of its four components (Shepperd)."""
     r = rotation
     squares = np.array([
         1 + r[0, 0] + r[1, 1] + r[2, 2], 1 + r[0, 0] - r[1, 1] - r[2, 2],
@@ -213,5 +209,4 @@ def _quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
     d, e, f = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
     rows = ((squares[0], a, b, c), (a, squares[1], d, e), (b, d, squares[2], f), (c, e, f, squares[3]))
     chosen = np.array(rows[int(squares.argmax())], np.float64)
-    w, x, y, z = (chosen / np.linalg.norm(chosen)).tolist()
-    return w, x, y, z
+    return np.asarray(chosen / np.linalg.norm(chosen))

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gsstream.core.changes.motion import quat_to_rotmat
 from gsstream.core.harmonics import sh_basis
 from gsstream.core.shapes import FloatArray, IntArray
 
@@ -68,13 +69,7 @@ def _project(
 
 def rotation_matrices(quats: FloatArray) -> FloatArray:
     """Return the rotations [N, 3, 3] of [N, 4] quaternions wxyz of any norm."""
-    w, x, y, z = (quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-10)).T
-    entries = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return np.asarray(np.stack(entries, -1).reshape(-1, 3, 3))
+    return quat_to_rotmat(quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-10))
 
 
 def _conics(covariance: FloatArray) -> FloatArray:

@@ -26,7 +26,7 @@ def gsstream_components() -> list[ComponentSpec]:
         _part("motion", "still", "parts.motion.none:Still", "nothing is carried along"),
         _part("motion", "coasting", "parts.motion.constant_velocity:Coasting", "what moved goes on moving"),
         _part("motion", "rigid", "parts.motion.rigid:Rigid", "one fitted rigid motion per group"),
-        _part("growth", "copies", "parts.growth.copies:Copies", "Gaussians copied where the gradient is large"),
+        _part("growth", "copies", "parts.growth.copying:Copies", "Gaussians copied where the gradient is large"),
         _part("growth", "none", "parts.growth.none:NoGrowth", "nothing is added and nothing is removed"),
         _part(
             "streaming_method",

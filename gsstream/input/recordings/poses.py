@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsstream.core.changes.motion import quat_to_rotmat
 from gsstream.core.shapes import FloatArray
 
 #: Camera axes x right, y up, z back (OpenGL, NeRF, Blender) -> x right, y down, z forward (OpenCV). Its own inverse.
@@ -31,13 +32,8 @@ def from_llff(rows: FloatArray) -> FloatArray:
 
 def from_quaternion(wxyz: FloatArray, translation: FloatArray) -> FloatArray:
     """Return [4, 4] world-to-camera, given wxyz [4] of any non-zero norm and translation [3] of a COLMAP image."""
-    w, x, y, z = wxyz / np.linalg.norm(wxyz)
     pose = np.eye(4)
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    pose[:3, :3] = quat_to_rotmat(wxyz[None] / np.linalg.norm(wxyz))[0]
     pose[:3, 3] = translation
     return pose
 

@@ -13,7 +13,7 @@ from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError
 from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.encode import Encoder, encoder_for, encoder_for_rig, open_recording
-from gsstream.engine.assembly.live import with_live
+from gsstream.engine.assembly.assemble import with_live
 from gsstream.engine.method.parts import PartsMethod
 from gsstream.method.static import Hold
 from gsstream.parts.motion.none import Still

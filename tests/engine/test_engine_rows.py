@@ -9,14 +9,12 @@ import torch
 from gsstream.core.changes import AddedGaussians, Delta, Residual, RowEdit
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
-from gsstream.core.topology import TopologyEdit
-from gsstream.engine.state.next_state import next_state
-from gsstream.engine.state.stream_state import StreamState
-from gsstream.engine.step.levels import current_level, level_schedule
+from gsstream.engine.state.stream_state import StreamState, next_state
+from gsstream.engine.step.optimise import current_level, level_schedule
 from gsstream.packet import decode_packet, encode_delta, encode_key
 from gsstream.parts.motion.none import Still
 from gsstream.parts.optimiser.adam import ReferenceAdam
-from gsstream.parts.optimiser.row_parameters import RowParameters
+from gsstream.parts.optimiser.row_parameters import RowParameters, TopologyEdit
 from gsstream.recipe.model import Stream
 from gsstream.testing.packet.checks import tiny_key
 from tests.scenes import make_scene

@@ -15,9 +15,9 @@ from numeric_scenes import some
 
 from gsstream.core.errors import ComponentError
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.engine.assembly.call_location import Where
 from gsstream.engine.assembly.checks import Checks, Look
-from gsstream.engine.step.dead_gates import count_dead_gates
+from gsstream.engine.assembly.fault import Where
+from gsstream.engine.step.optimise import count_dead_gates
 from gsstream.parts.gate.always_open import AlwaysOpen
 
 EXTREMES = torch.tensor([-1e4, -100.0, -17.5, -6.9, -1e-30, 0.0, 1e-30, 6.9, 17.5, 100.0, 1e4])

@@ -13,7 +13,7 @@ from scipy.ndimage import uniform_filter
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.projection import project
-from gsstream.engine.run.threads import one_torch_thread
+from gsstream.engine.run.encoder import one_torch_thread
 from gsstream.input.seeds import room
 from gsstream.input.seeds.fusion import world_points
 from gsstream.input.seeds.geometry import focus_point, spread_views

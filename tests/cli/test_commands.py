@@ -31,6 +31,7 @@ CHEAP = [
 ]
 
 RUN = ["run", "--source", "demo", "--out", "OUT"]
+SLOW = [*RUN, "--set", "renderer=reference"]
 
 OPTIONS = {
     "gsstream": ["--debug", "--version", "--install-completion", "--show-completion"],
@@ -159,6 +160,12 @@ def run(capsys: pytest.CaptureFixture[str], *args: str) -> tuple[int, str, str]:
     [
         ([*RUN, "--method", "dens"], "no method named 'dens'; did you mean 'dense'?"),
         ([*RUN, "--set", "lss.backend=1"], "--set lss.backend=1: unknown key 'lss'; did you mean 'loss'?"),
+        ([*SLOW, "--set", "gate=always-opne"], "--set gate=always-opne: gate.name: no gate named 'always-opne'; did"),
+        ([*RUN, "--set", "renderer=referense"], "--set renderer=referense: renderer.name: no renderer named 'referen"),
+        ([*SLOW, "--set", "gate.temperatur=1"], "--set gate.temperatur=1: unknown key 'gate.params.temperatur'; none"),
+        ([*SLOW, "--source", "dmo"], "source 'dmo': no such folder and no known scheme; expected 'demo'"),
+        ([*SLOW, "--source", "synthetic:frame=3"], "synthetic source: unknown option 'frame'; did you mean 'frames'?"),
+        ([*SLOW, "--first-frame", "absent.gss"], "no stream at absent.gss: expected a .gss file or the output folder"),
         ([*RUN, "--frames", "0"], "--frames frames=0: frames: input should be greater than or equal to 1, got 0"),
         ([*RUN, "--recipe", "absent.yaml"], "cannot read the recipe absent.yaml: "),
         ([*RUN, "--budget", "siz=20KB"], "--budget siz=20KB: unknown key 'siz'; did you mean 'size'?"),

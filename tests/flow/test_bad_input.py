@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 import shutil
 import subprocess
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 from flow_runs import WORLD, arguments, demo_copy, encode, finish, metrics
-from PIL import Image
 
 from gsstream.cli.main import run_command
-from gsstream.packet import StreamReader
 
 ROOT = Path(__file__).parents[2]
 
@@ -34,109 +29,27 @@ def refused(capsys: pytest.CaptureFixture[str], command: list[str], code: int = 
     return err.removeprefix("error: ")
 
 
-def camera(data: dict[str, Any], **values: Any) -> None:
-    data["cameras"][1].update(values)
+def singular(folder: Path) -> str:
+    data = json.loads((folder / "cameras.json").read_text())
+    data["cameras"][1]["K"] = [[0, 0, 80], [0, 150, 60], [0, 0, 1]]
+    (folder / "cameras.json").write_text(json.dumps(data))
+    return "camera 'cam01' are not invertible"
 
 
-def poison(data: dict[str, Any]) -> None:
-    data["cameras"][1]["w2c"][0][3] = math.nan
+def lost(folder: Path) -> str:
+    (folder / "cam01" / "000002.jpg").unlink()
+    return f"camera 'cam01': 1 of 3 frames are missing, the first is {folder / 'cam01' / '000002.jpg'}"
 
 
-CALIBRATIONS: dict[str, tuple[Callable[[dict[str, Any]], None], list[str]]] = {
-    "camera without frames": (
-        lambda d: camera(d, frames="nowhere/%06d.jpg"),
-        ["camera 'cam01' has no frames; expected ", "nowhere/000000.jpg"],
-    ),
-    "camera without a pattern": (lambda d: camera(d, frames=None), ["camera 'cam01' has no frames; give \"frames\""]),
-    "no inverse": (
-        lambda d: camera(d, K=[[0, 0, 80], [0, 150, 60], [0, 0, 1]]),
-        ["cameras.json", "camera 'cam01' are not invertible"],
-    ),
-    "NaN pose": (poison, ["cameras.json", "pose ", "camera 'cam01'", "nan"]),
-    "sizes differ": (lambda d: camera(d, width=80), ["'cam00' is 160 x 120 and 'cam01' is 80 x 120"]),
-}
-
-
-@pytest.mark.parametrize("fault", CALIBRATIONS)
-def test_faulty_calibrations(tmp_path: Path, capsys: pytest.CaptureFixture[str], fault: str) -> None:
-    edit, words = CALIBRATIONS[fault]
-    folder = demo_copy(tmp_path / "r", edit=edit)
-    err = refused(capsys, arguments(tmp_path / "o", source=str(folder)))
-    for word in words:
-        assert word in err
-    assert not (tmp_path / "o").exists(), "a recording that cannot be read leaves no folder behind"
-
-
-def test_a_missing_image_is_noticed_before_anything_is_trained(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = demo_copy(tmp_path / "r")
-    lost = folder / "cam01" / "000002.jpg"
-    lost.unlink()
-    err = refused(capsys, arguments(tmp_path / "o", source=str(folder)))
-    assert f"camera 'cam01': 1 of 3 frames are missing, the first is {lost}" in err
-    assert not (tmp_path / "o").exists()
-
-
-def truncated(path: Path) -> str:
-    path.write_bytes(path.read_bytes()[:700])
-    return "the image cannot be decoded"
-
-
-def smaller(path: Path) -> str:
-    Image.fromarray(np.zeros((60, 80, 3), np.uint8)).save(path)
-    return "the image is 80 x 60 pixels, but cameras.json declares 160 x 120"
-
-
-@pytest.mark.parametrize("spoil", [truncated, smaller])
-def test_a_bad_image_later_on_costs_only_what_comes_after_it(
+@pytest.mark.parametrize("spoil", [singular, lost])
+def test_a_recording_that_cannot_be_read_leaves_no_folder_behind(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], spoil: Callable[[Path], str]
 ) -> None:
-    folder, out = demo_copy(tmp_path / "r"), tmp_path / "o"
-    image = folder / "cam01" / "000002.jpg"
-    good = image.read_bytes()
-    message = spoil(image)
-    command = arguments(out, source=str(folder), scale=0.4)
-    err = refused(capsys, command)
-    assert str(image) in err
-    assert message in err
-    with StreamReader(out / "stream.gss") as reader:
-        assert [entry.frame for entry in reader.frames] == [0, 1]
-    image.write_bytes(good)
-    assert run_command([*command, "--resume"]) == 0
-    assert [line["frame"] for line in metrics(out)] == [0, 1, 2]
-    assert (out / "stream.gss").read_bytes() == encode(tmp_path / "u", source=str(folder), scale=0.4)
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        (["--method", "s2gs-egde"], "no method named 's2gs-egde'; did you mean 's2gs-edge'?"),
-        (["--set", "gate=gumbel-sigmoit"], "gate.name: no gate named 'gumbel-sigmoit'; did you mean 'gumbel-sigmoid'?"),
-        (["--set", "stream.epoch=3"], "unknown key 'stream.epoch'; did you mean 'epochs'?"),
-        (
-            ["--method", "s2gs", "--set", "gate.temperatur=1"],
-            "unknown key 'gate.params.temperatur'; did you mean 'temperature'?",
-        ),
-        (["--source", "dmo"], "source 'dmo': no such folder and no known scheme; expected 'demo'"),
-        (["--source", "synthetic:frame=3"], "unknown option 'frame'; did you mean 'frames'?"),
-        (["--set", "renderer=cpuu"], "no renderer named 'cpuu'; did you mean 'cpu'?"),
-        (["--first-frame", "absent.gss"], "no stream at absent.gss: expected a .gss file or the output folder"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else None,
-)
-def test_names_that_do_not_exist(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: list[str], words: str
-) -> None:
-    assert words in refused(capsys, [*arguments(tmp_path / "o"), *changes])
-
-
-def test_an_unknown_key_in_a_file_is_named_with_its_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    recipe = tmp_path / "mine.yaml"
-    recipe.write_text("stream:\n  epochs: 3\nfirst_frame:\n  sh_degre: 1\n")
-    err = refused(capsys, arguments(tmp_path / "o", "--recipe", str(recipe)))
-    assert "mine.yaml:4" in err
-    assert "unknown key 'first_frame.sh_degre'; did you mean 'sh_degree'?" in err
+    """Before anything is trained. Every fault and its words: tests/input/recordings/test_source_multiview.py."""
+    folder = demo_copy(tmp_path / "r")
+    message = spoil(folder)
+    assert message in refused(capsys, arguments(tmp_path / "o", source=str(folder)))
+    assert not (tmp_path / "o").exists()
 
 
 def test_a_folder_with_another_run_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -201,26 +114,6 @@ def test_make_says_that_a_compiler_is_missing(tmp_path: Path) -> None:
     assert "nothing may be installed" not in result.stderr
 
 
-FAILING = textwrap.dedent("""
-    from typing import final
-    import torch
-    from gsstream.api import ConfidenceEstimator
-    from gsstream.spec import ComponentSpec, hookimpl
-
-    @hookimpl
-    def gsstream_components():
-        target = "gsstream_failing:Failing"
-        return [ComponentSpec(kind="confidence", name="failing", target=target, summary="breaks in frame 3")]
-
-    @final
-    class Failing(ConfidenceEstimator):
-        def estimate(self, context):
-            if context.index == 3:
-                raise ZeroDivisionError("of my own making")
-            return torch.zeros(len(context.gaussians))
-""")
-
-
 @pytest.fixture
 def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], None]:
     """Install a plugin, given as text, for this process."""
@@ -234,38 +127,6 @@ def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, s
         monkeypatch.syspath_prepend(str(folder))
 
     return install
-
-
-def test_a_part_that_fails_is_named_and_costs_one_frame(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], plugins: Callable[[str, str], None]
-) -> None:
-    plugins("failing", FAILING)
-    out = tmp_path / "o"
-    err = refused(capsys, arguments(out, confidence="failing"), code=1)
-    assert err.startswith(
-        "confidence 'Failing' (from gsstream-failing) failed at frame 3: ZeroDivisionError: of my own making"
-    )
-    assert "complete up to frame 2" in err
-    with StreamReader(out / "stream.gss") as reader:
-        reader.check()
-        assert [entry.frame for entry in reader.frames] == [0, 1, 2]
-        assert reader.unfinished is None
-    assert run_command(["--debug", *arguments(out, "--resume", confidence="failing")]) == 1
-    assert "raise ZeroDivisionError" in capsys.readouterr().err, "--debug shows where"
-
-
-def test_a_plugin_that_cannot_be_imported_stops_only_who_asks_for_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], plugins: Callable[[str, str], None]
-) -> None:
-    plugins("lost", "import a_module_that_nobody_has\n")
-    err = refused(capsys, arguments(tmp_path / "o", method="lost"), code=1)
-    assert "method 'lost' is not available: plugin 'lost' (from gsstream-lost 0.7) is in quarantine" in err
-    assert "No module named 'a_module_that_nobody_has'" in err
-    encode(tmp_path / "o", "--frames", "1")
-    assert run_command(["methods"]) == 0
-    out, err = capsys.readouterr()
-    assert "s2gs-edge" in out
-    assert "warning: plugin 'lost' (gsstream-lost) is in quarantine" in err
 
 
 def test_a_source_of_a_plugin_is_opened_and_its_faults_are_its_own(

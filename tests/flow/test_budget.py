@@ -50,12 +50,6 @@ def test_sizes_hold_in_the_file_and_are_reported(held: Path) -> None:
     assert f"size: {SIZE}" in (held / "out" / "recipe.yaml").read_text()
 
 
-def test_another_budget_is_not_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    encode(tmp_path, "--frames", "2", *TIGHT, method="s2gs-edge")
-    assert run_command(arguments(tmp_path, "--resume", "--budget", "size=2KB", method="s2gs-edge")) == 2
-    assert "another recipe: budget differ" in capsys.readouterr().err
-
-
 def test_a_time_that_cannot_be_held_is_said_frame_by_frame(tmp_path: Path) -> None:
     """A millisecond is gone before the first view: one view is made, and every frame says that it is late."""
     encode(tmp_path, "--budget", "time=1ms", method="s2gs-edge", stream__epochs=2)
@@ -113,18 +107,3 @@ def test_seeds_are_limited_as_well_as_growth(tmp_path: Path) -> None:
     """A structure places several anchors for a point; a recording once began with half as many again as allowed."""
     encode(tmp_path, "--frames", "2", method="s2gs-edge", first_frame__max_gaussians=90)
     assert all(0 < line["num_gaussians"] <= 90 for line in metrics(tmp_path))
-
-
-def test_a_whole_method_has_no_budget_of_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(arguments(tmp_path, "--budget", "size=1KB", method="hold")) == 2
-    assert "budget.size: the streaming_method 'hold' does not read it" in capsys.readouterr().err
-
-
-def test_a_budget_is_data(tmp_path: Path) -> None:
-    recipe = tmp_path / "mine.yaml"
-    recipe.write_text(f"base: s2gs-edge\nbudget: {{size: {SIZE / 1000}KB}}\n")
-    encode(tmp_path / "file", "--recipe", str(recipe), "--frames", "2", method="s2gs-edge")
-    encode(tmp_path / "option", *TIGHT, "--frames", "2", method="s2gs-edge")
-    ours, theirs = ((tmp_path / name / "stream.gss").read_bytes() for name in ("file", "option"))
-    assert ours == theirs
-    assert metrics(tmp_path / "file")[1]["budget"]["limits"] == {"size": SIZE}

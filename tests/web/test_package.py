@@ -16,6 +16,7 @@ from PIL import Image
 from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError, OutputError, PacketError
 from gsstream.packet import StreamReader, StreamWriter
+from gsstream.packet.base import file_header
 from gsstream.player.playback import Playback
 from gsstream.serve.package import package
 
@@ -42,7 +43,12 @@ def test_segments_hold_the_bytes_of_the_stream(tmp_path):
     with StreamReader(stream) as reader:
         bodies = b"".join(data[e.offset : e.offset + e.size] for e in reader.frames)
     names = segments(tmp_path / "site")
-    assert b"".join((tmp_path / "site" / name).read_bytes()[16:] for name in names) == bodies
+    files = [tmp_path / "site" / name for name in names]
+    parts = [file.read_bytes() for file in files]
+    assert b"".join(part[16:] for part in parts) == bodies
+    assert {part[:16] for part in parts} == {file_header()}
+    frames = [tuple(reader.frames[i].frame for i in (0, -1)) for reader in map(StreamReader, files)]
+    assert frames == [(0, 2), (3, 5)], "each is a stream of its own"
     assert sorted(p.name for p in (tmp_path / "site" / "segments").iterdir()) == sorted(Path(n).name for n in names)
 
 

@@ -14,7 +14,6 @@ from pictures import decoded, drawn, psnr
 
 from gsstream.cli.main import run_command
 from gsstream.packet import StreamWriter
-from gsstream.packet.base import file_header
 from gsstream.player.playback import Playback
 from gsstream.serve.package import package
 
@@ -269,15 +268,3 @@ def test_the_page_is_small(site):
     assert len(sizes) > 20
     assert sum(sizes.values()) <= 60_000
     assert sum(later) <= 11_900
-
-
-def test_a_segment_is_a_stream_of_its_own(site):
-    manifest = json.loads((site / "stream.json").read_text())
-    with Playback(site / "stream.gss") as whole:
-        for segment in manifest["segments"]:
-            assert (site / segment["file"]).read_bytes().startswith(file_header())
-            with Playback(site / segment["file"]) as part:
-                assert [part.frames[0], part.frames[-1]] == segment["frames"]
-                for frame in part.frames:
-                    pairs = zip(part.state_at(frame).items(), whole.state_at(frame).items(), strict=True)
-                    assert all(a.tobytes() == b.tobytes() for (_, a), (_, b) in pairs)

@@ -145,38 +145,6 @@ def test_unknown_names_mention_quarantine(lab) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("speaks", "refused", "advice"),
-    [
-        ("2.4", {"other_major": "3.0", "older_major": "1.0"}, "upgrade gsstream"),
-        ("2.2", {"other_major": "3.0", "older_major": "1.0", "newer_minor": "2.3"}, "upgrade gsstream"),
-        ("3.1", {"older_major": "1.0", "newer_minor": "2.3", "healthy": "2.0"}, "ask its author for a newer version"),
-    ],
-)
-def test_the_rule_for_versions_as_gsstream_grows(lab, speaks: str, refused: dict[str, str], advice: str) -> None:
-    """Tiny distributions written for 1.0, 2.0, 2.3 and 3.0, and a gsstream that speaks another version each time."""
-    for fault in ("other_major", "older_major"):
-        lab.install(fault)
-    newer = (BROKEN / "newer_minor.py").read_text().partition("@hookimpl\ndef gsstream_viewers")[0]
-    lab.add("newer_minor", newer)
-    lab.add("healthy", HEALTHY.replace('summary="mine"', 'summary="mine", api="2.0"'))
-    code = (
-        "import sys, gsstream\ngsstream.API_VERSION = sys.argv.pop(1)\n"
-        "import gsstream.plugins.builtin\nfrom gsstream.cli.main import main\nmain()\n"
-    )
-    listing = lab.python(code, speaks, "plugins")
-    assert listing.returncode == 0, listing.stderr
-    rows = {line.split()[0]: line for line in listing.stdout.splitlines() if line}
-    for name in ("other_major", "older_major", "newer_minor", "healthy"):
-        if name in refused:
-            reason = f"built for component API {refused[name]}, this gsstream speaks {speaks}: "
-            assert "quarantined: " in rows[name]
-            assert reason in rows[name]
-        else:
-            assert "quarantined" not in rows[name], "an older minor version, or the same one, is fine"
-    assert advice in "".join(rows[name] for name in refused)
-
-
 def test_a_command_in_quarantine_says_why_and_costs_no_other(lab) -> None:
     lab.install("command_clash")
     shown = lab.cli("--help")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 import pickle
-import random
 
 import numpy as np
 import pytest
@@ -112,11 +111,6 @@ class TestCameras:
         getattr(cameras, field)[index] = value
         with pytest.raises(ShapeError, match=message):
             cameras.validate()
-
-    @pytest.mark.parametrize("near", [0.0, -1.0, np.nan])
-    def test_near_plane_is_positive(self, near: float) -> None:
-        with pytest.raises(ShapeError, match=r"near plane: expected a positive distance"):
-            dataclasses.replace(rig(), near_plane=near).validate()
 
     def test_near_plane_survives_select_and_scaled(self) -> None:
         cameras = dataclasses.replace(rig(3), near_plane=0.7)
@@ -225,10 +219,6 @@ class TestHierarchy:
             tree_roots(parent)
 
 
-def numpy_state() -> bytes:
-    return np.random.get_state()[1].tobytes()  # noqa: NPY002 - the legacy global state is what must not move
-
-
 class TestRng:
     def test_streams_repeat_and_differ(self) -> None:
         def draw(seed: int, name: str, frame: int) -> list[float]:
@@ -242,15 +232,6 @@ class TestRng:
     def test_key_is_frozen_across_versions(self) -> None:
         assert Rng(7).key("gate", 12) == 959750397700549290
         assert 0 <= Rng(2**70).key("x", 0) < 2**63
-
-    def test_global_generators_are_untouched(self) -> None:
-        before = (torch.get_rng_state(), numpy_state(), random.getstate())
-        Rng(0).stream("a").initial_seed()
-        torch.rand(3, generator=Rng(0).stream("a"))
-        Rng(0).numpy("a").normal(size=3)
-        assert torch.equal(torch.get_rng_state(), before[0])
-        assert numpy_state() == before[1]
-        assert random.getstate() == before[2]
 
     def test_streams_look_independent(self) -> None:
         a = Rng(0).numpy("a", 0).normal(size=20_000)

@@ -29,7 +29,7 @@ from gsstream.core.changes import (
 )
 from gsstream.core.changes.motion import HALF_GRID, MAX_CELLS_PER_ROW
 from gsstream.core.errors import ShapeError
-from gsstream.core.gaussians import SH0, Gaussians
+from gsstream.core.gaussians import Gaussians
 
 SEEDS = st.integers(0, 2**32 - 1)
 NAMES = ("means", "quats")
@@ -358,7 +358,7 @@ ROWS, CELL = 300, 0.25
 
 @pytest.mark.parametrize("reach", [1.0, 30.0, 1e7])
 @pytest.mark.parametrize("brightness_bins", [1, 5])
-def test_groups_are_numbered_as_sorting_their_cells_would(reach: float, brightness_bins: int) -> None:
+def test_groups_are_those_of_the_text_by_a_table_and_by_sorting(reach: float, brightness_bins: int) -> None:
     """Rows whose cells fit into a table, rows too far apart for one, and rows beyond the end of the grid."""
     rng = np.random.default_rng(2)
     means = (reach * rng.uniform(-1, 1, (ROWS, 3)) ** 3).astype(np.float32)
@@ -370,11 +370,7 @@ def test_groups_are_numbered_as_sorting_their_cells_would(reach: float, brightne
     index = np.floor(means.astype(np.float64) / CELL)
     cells = np.clip(index, -HALF_GRID, HALF_GRID - 1).astype(int)
     assert (np.ptp(cells, axis=0).prod() > MAX_CELLS_PER_ROW * ROWS) == (reach > 1), "both ways are looked at"
-    red, green, blue = colours[:, 0].astype(np.float64).T
-    bright = 0.5 + SH0 * (0.25 * red + 0.5 * green + 0.25 * blue)
-    tones = np.clip(np.floor(bright * brightness_bins), 0, brightness_bins - 1).astype(int).tolist()
-    names = [(*cell, tone) for cell, tone in zip(cells.tolist(), tones, strict=True)]
-    order = sorted(set(names))
-    assert groups.count == len(order)
+    world = World.of(gaussians)
+    world.form_groups(CELL, brightness_bins, False)
     assert groups.group_of.dtype == np.int32
-    assert groups.group_of.tolist() == [order.index(name) for name in names]
+    assert (groups.group_of.tolist(), groups.count) == (world.group_of, world.count)

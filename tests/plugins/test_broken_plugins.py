@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
-
-BROKEN = Path(__file__).parent / "broken"
 
 REASONS = {
     "raises_at_import": "ModuleNotFoundError: No module named 'a_package_nobody_has'",

@@ -27,6 +27,13 @@ needs_browser = pytest.mark.skipif(
 )
 
 
+#: The player of a page, what it shows in its own tree, what it says; a step that waits for its first picture.
+PLAYER = "document.querySelector('gsstream-player')?.player"
+ROOT = "document.querySelector('gsstream-player')?.shadowRoot"
+MESSAGE = f"({ROOT}?.querySelector('.message')?.textContent ?? '')"
+READY = ["until", f"{PLAYER}?.state && {PLAYER}._target === null"]
+
+
 class Handler(SimpleHTTPRequestHandler):
     """A static server.
 
@@ -137,3 +144,8 @@ def try_in_browser(
     found = json.loads(out.read_text())
     assert found["failure"] is None, found
     return found["results"], found["messages"]
+
+
+def at(url: str, steps: Sequence[Sequence[Any]]) -> list[list[Any]]:
+    """The steps with the address of a server in the place of URL."""
+    return [[item.replace("URL", url) if isinstance(item, str) else item for item in step] for step in steps]

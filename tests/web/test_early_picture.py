@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser_runs import in_browser, needs_browser, serving, try_in_browser
+from browser_runs import MESSAGE, PLAYER, READY, at, in_browser, needs_browser, serving, try_in_browser
 from decoder_fuzz import digest
 from node_runs import needs_node, node, play_in_node
 from packet_scenes import make_key
@@ -78,9 +78,6 @@ def test_packets_with_layers_decode_to_the_same_bits(tmp_path, share, sh_rest, n
     assert found["digests"] == [digest(decode_key(packet.data).gaussians)]
 
 
-PLAYER = "document.querySelector('gsstream-player')?.player"
-MESSAGE = "document.querySelector('gsstream-player').shadowRoot.querySelector('.message').textContent"
-READY = ["until", f"{PLAYER}?.state && {PLAYER}._target === null"]
 EARLY = f"{PLAYER}?.statistics.early"
 #: RGBA bytes of what the renderer has, from the camera that is looked from first, at the size of the recording.
 PICTURE = f"""(async () => {{
@@ -135,7 +132,7 @@ def test_the_first_layer_is_drawn_before_the_rest_is_there(tmp_path, name):
         ["evaluate", f"[{PLAYER}.state.number, {PLAYER}.frame, {PLAYER}.problem, {MESSAGE}]"],
     ]  # fmt: skip
     with serving(tmp_path / "site", held_after=needed(packet)) as (url, _):
-        results = in_browser(_at(url, steps), tmp_path, size=(64, 48))
+        results = in_browser(at(url, steps), tmp_path, size=(64, 48))
     assert results[2] == [150, None]
     early, late = (decoded(results[i], 32, 24) for i in (3, 6))
     with Playback(first) as some, Playback(stream) as whole:
@@ -155,7 +152,7 @@ def test_a_byte_less_than_the_first_layer_draws_nothing(tmp_path):
         ["evaluate", "fetch('mended')"], READY, ["evaluate", f"{PLAYER}.problem"],
     ]  # fmt: skip
     with serving(tmp_path / "site", held_after=needed(packet) - 1) as (url, _):
-        results = in_browser(_at(url, steps), tmp_path, size=(64, 48))
+        results = in_browser(at(url, steps), tmp_path, size=(64, 48))
     assert results[3] == [None, None, 0]
     assert results[-1] is None
 
@@ -177,7 +174,7 @@ def test_a_damaged_layer_does_no_harm(tmp_path, where):
         ["evaluate", MESSAGE], ["evaluate", f"{PLAYER}.state"],
     ]  # fmt: skip
     with serving(tmp_path / "site", held_after=needed(packet)) as (url, _):
-        results, messages = try_in_browser(_at(url, steps), tmp_path, size=(64, 48))
+        results, messages = try_in_browser(at(url, steps), tmp_path, size=(64, 48))
     assert results[3] == (None if where == "first" else 150)
     assert "damaged" in results[6]
     assert results[7] is None
@@ -189,11 +186,7 @@ def test_a_stream_without_layers_loads_nothing_for_them(tmp_path):
     key, _ = layered()
     package(written(tmp_path, encode_key(key)), tmp_path / "site")
     with serving(tmp_path / "site") as (url, server):
-        in_browser(_at(url, [["go", "URL/index.html"], READY]), tmp_path, size=(64, 48))
+        in_browser(at(url, [["go", "URL/index.html"], READY]), tmp_path, size=(64, 48))
         asked = {path for path, _ in server.requests}
     assert "/decode.js" in asked
     assert not {"/layers.js", "/early.js"} & asked
-
-
-def _at(url: str, steps: list) -> list:
-    return [[item.replace("URL", url) if isinstance(item, str) else item for item in step] for step in steps]

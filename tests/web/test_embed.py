@@ -7,16 +7,13 @@ import shutil
 from pathlib import Path
 
 import pytest
-from browser_runs import in_browser, needs_browser, serving, try_in_browser
+from browser_runs import MESSAGE, PLAYER, ROOT, at, in_browser, needs_browser, serving, try_in_browser
 from moving_scenes import moving_packets
 
 from gsstream.packet import StreamWriter
 from gsstream.serve.package import package
 
 pytestmark = needs_browser
-PLAYER = "document.querySelector('gsstream-player')?.player"
-ROOT = "document.querySelector('gsstream-player')?.shadowRoot"
-MESSAGE = f"{ROOT}.querySelector('.message').textContent"
 #: A page of somebody else: text, the player, and much more text.
 OUTER = """<!doctype html><meta name="viewport" content="width=device-width"><style>body { margin: 0 }</style>
 <p>Text.</p><script type="module" src="element.js"></script><gsstream-player src="stream.json"></gsstream-player>
@@ -33,8 +30,7 @@ def outer(site):
 def look(site: Path, tmp_path: Path, steps: list, **settings: object) -> list:
     """Carry out steps on a served site, whose address is URL in them."""
     with serving(site) as (url, _):
-        at = [[item.replace("URL", url) if isinstance(item, str) else item for item in step] for step in steps]
-        return in_browser(at, tmp_path, **settings)
+        return in_browser(at(url, steps), tmp_path, **settings)
 
 
 @pytest.mark.parametrize("limits", ["", "none"])
@@ -164,8 +160,7 @@ def test_the_poster_is_shown_until_the_first_picture(site, tmp_path, page, poste
         ["evaluate", state], ["evaluate", "fetch('mended')"], READY, ["evaluate", state],
     ]  # fmt: skip
     with serving(site, held_after=100) as (url, _):
-        steps = [[item.replace("URL", url) if isinstance(item, str) else item for item in step] for step in steps]
-        results = in_browser(steps, tmp_path)
+        results = in_browser(at(url, steps), tmp_path)
     assert results[3] == [poster, False, "Loading …"]
     assert results[-1] == [False, True, ""]
 

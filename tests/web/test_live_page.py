@@ -11,7 +11,7 @@ import time
 import zlib
 
 import pytest
-from browser_runs import needs_browser
+from browser_runs import MESSAGE, PLAYER, ROOT, needs_browser
 from live_runs import HEADER, Growing, assert_playable, browsing, live_socket, packets_from, served
 from moving_scenes import moving_packets
 
@@ -22,9 +22,6 @@ from tests.flow import capture
 from tests.flow.flow_runs import TINY, demo_copy
 
 pytestmark = needs_browser
-PLAYER = "document.querySelector('gsstream-player')?.player"
-ROOT = "document.querySelector('gsstream-player')?.shadowRoot"
-MESSAGE = f"({ROOT}?.querySelector('.message')?.textContent ?? '')"
 #: Seconds that an encoder may take on a machine that has much else to do.
 SLOW = 120
 #: Connect again at once: nobody waits for seconds here.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser_runs import in_browser, needs_browser, serving, try_in_browser
+from browser_runs import MESSAGE, PLAYER, READY, ROOT, at, in_browser, needs_browser, serving, try_in_browser
 from moving_scenes import make_meta, moving_packets
 from pictures import decoded, drawn, psnr
 
@@ -18,10 +18,6 @@ from gsstream.player.playback import Playback
 from gsstream.serve.package import package
 
 pytestmark = needs_browser
-PLAYER = "document.querySelector('gsstream-player')?.player"
-ROOT = "document.querySelector('gsstream-player').shadowRoot"
-MESSAGE = f"{ROOT}.querySelector('.message').textContent"
-READY = ["until", f"{PLAYER}?.state && {PLAYER}._target === null"]
 SIZE = (120, 90)
 
 
@@ -77,7 +73,7 @@ def test_playing_seeking_keys_and_views(site, tmp_path):
         ["evaluate", f"{ROOT}.querySelector('.camera').options.length"],
     ]  # fmt: skip
     with serving(site) as (url, _):
-        results = in_browser(_at(url, steps), tmp_path, size=(200, 100))
+        results = in_browser(at(url, steps), tmp_path, size=(200, 100))
     second, first, before, after, nearer, marks, cameras = (results[i] for i in (7, 9, 10, 12, 15, 17, 18))
     assert (second, first) == ("left", "held-out")
     assert before != after != nearer
@@ -95,7 +91,7 @@ def test_a_picture_that_does_not_change_is_not_drawn_again(site, tmp_path):
         ["evaluate", f"{PLAYER}.frame"],
     ]  # fmt: skip
     with serving(site) as (url, server):
-        results = in_browser(_at(url, steps), tmp_path, size=SIZE)
+        results = in_browser(at(url, steps), tmp_path, size=SIZE)
     first, later, turned, jumped, back, frame = (results[i] for i in (3, 5, 8, 11, 14, 15))
     # One was drawn before there was any order, one for every packet that came, and two after a jump.
     assert first == later == 1
@@ -105,10 +101,6 @@ def test_a_picture_that_does_not_change_is_not_drawn_again(site, tmp_path):
     manifest = json.loads((site / "stream.json").read_text())
     for segment in manifest["segments"]:
         assert server.requests.count((f"/{segment['file']}", None)) == 1
-
-
-def _at(url: str, steps: list) -> list:
-    return [[item.replace("URL", url) if isinstance(item, str) else item for item in step] for step in steps]
 
 
 @pytest.mark.parametrize(
@@ -130,7 +122,7 @@ def test_every_frame_is_reached_whatever_the_server_does(site, tmp_path, name, f
         ["evaluate", f"[{PLAYER}.first, {PLAYER}.last, {PLAYER}.problem]"],
     ]  # fmt: skip
     with serving(site, **faults) as (url, server):
-        results, _ = try_in_browser(_at(url, steps), tmp_path, size=SIZE)
+        results, _ = try_in_browser(at(url, steps), tmp_path, size=SIZE)
     assert results[-1] == [0, 11, None]
     asked = [wanted for path, wanted in server.requests if path == "/stream.gss"]
     assert (name == "stream.gss") == bool(asked)
@@ -141,7 +133,7 @@ def test_a_seek_in_a_file_with_an_index_fetches_the_last_segment_first(site, tmp
         ["go", "URL/index.html?src=stream.gss"], READY, ["evaluate", f"{PLAYER}.buffer.parts.length"],
     ]  # fmt: skip
     with serving(site) as (url, server):
-        results = in_browser(_at(url, steps), tmp_path, size=SIZE)
+        results = in_browser(at(url, steps), tmp_path, size=SIZE)
         ranges = [wanted for path, wanted in server.requests if path == "/stream.gss"]
     assert results[-1] == 2
     assert ranges[0] == "bytes=-12"
@@ -155,7 +147,7 @@ def test_another_rendition_shows_the_same_frame(tmp_path):
             for packet in moving_packets(seed=3, frames=8, number=number, nodes=10, key_at=5):
                 writer.append(packet)
     package(streams[0], tmp_path / "site", renditions=streams[1:])
-    choose = f"{ROOT}.querySelector('.rendition')"
+    choose = "document.querySelector('gsstream-player').shadowRoot.querySelector('.rendition')"
     steps = [
         ["go", "URL/index.html"], READY, ["evaluate", f"{PLAYER}.seek(6)"], ["until", f"{PLAYER}.frame === 6"],
         ["evaluate", f"{PLAYER}.state.number"], ["evaluate", f"{choose}.hidden"],
@@ -163,7 +155,7 @@ def test_another_rendition_shows_the_same_frame(tmp_path):
         ["evaluate", f"{PLAYER}.state.number"], ["picture", 7, 32, 24],
     ]  # fmt: skip
     with serving(tmp_path / "site") as (url, _):
-        results = in_browser(_at(url, steps), tmp_path, size=SIZE)
+        results = in_browser(at(url, steps), tmp_path, size=SIZE)
     with Playback(streams[0]) as full, Playback(streams[1]) as small:
         assert (results[4], results[5], results[8]) == (len(full.state_at(6)), False, len(small.state_at(6)))
         expected = drawn(small, 7)
@@ -194,7 +186,7 @@ def test_what_is_wrong_is_said_in_one_sentence(site, tmp_path):
         steps += [["go", f"URL/index.html?src={name}"], ["until", said]]
         steps += [["evaluate", MESSAGE]]
     with serving(site) as (url, _):
-        results, _ = try_in_browser(_at(url, steps), tmp_path, size=SIZE)
+        results, _ = try_in_browser(at(url, steps), tmp_path, size=SIZE)
     for (name, words), text in zip(expected.items(), results[2::3], strict=True):
         assert words in text, name
         assert "\n" not in text
@@ -220,7 +212,7 @@ def test_what_is_sound_is_played(site, tmp_path, name):
         ["evaluate", f"{PLAYER}.frame"], ["evaluate", f"{PLAYER}.problem !== null"],
     ]  # fmt: skip
     with serving(site) as (url, _):
-        results, _ = try_in_browser(_at(url, steps), tmp_path, size=SIZE)
+        results, _ = try_in_browser(at(url, steps), tmp_path, size=SIZE)
     assert 0 < frames < 7
     # Slowly, since a page that draws late leaves frames out, and might leave out all the damaged ones.
     # Of the damaged file the second segment is sound, which is said; a file that just ends is one being written.
@@ -235,7 +227,7 @@ def test_a_server_that_stops_is_told_and_what_is_loaded_plays_on(site, tmp_path)
         ["evaluate", "fetch('mended')"], ["evaluate", f"{PLAYER}.play()"], ["until", f"{PLAYER}.frame >= 9"],
     ]  # fmt: skip
     with serving(site, gone_after=1) as (url, _):
-        results, _ = try_in_browser(_at(url, steps), tmp_path, size=SIZE)
+        results, _ = try_in_browser(at(url, steps), tmp_path, size=SIZE)
     assert "connection" in results[4]
 
 
@@ -243,7 +235,7 @@ def test_a_browser_without_webgl_says_so(site, tmp_path):
     shown = "document.querySelector('gsstream-player')?.shadowRoot"
     steps = [["go", "URL/index.html"], ["until", shown], ["evaluate", MESSAGE]]
     with serving(site) as (url, _):
-        (*_, text), _ = try_in_browser(_at(url, steps), tmp_path, flags=["--disable-3d-apis"], size=SIZE)
+        (*_, text), _ = try_in_browser(at(url, steps), tmp_path, flags=["--disable-3d-apis"], size=SIZE)
     assert "WebGL2" in text
 
 
@@ -251,7 +243,7 @@ def test_the_page_works_in_a_frame_of_another_page(site, tmp_path):
     (site / "outer.html").write_text("<!doctype html><iframe src='index.html' width=100 height=80></iframe>")
     inner = "document.querySelector('iframe')?.contentDocument?.querySelector('gsstream-player')?.player?.state"
     with serving(site) as (url, _):
-        in_browser(_at(url, [["go", "URL/outer.html"], ["until", inner]]), tmp_path, size=SIZE)
+        in_browser(at(url, [["go", "URL/outer.html"], ["until", inner]]), tmp_path, size=SIZE)
 
 
 def test_the_page_is_small(site):

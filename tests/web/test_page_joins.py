@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from browser_runs import needs_browser, serving, try_in_browser
+from browser_runs import PLAYER, READY, at, needs_browser, serving, try_in_browser
 from moving_scenes import moving_packets
 
 from gsstream.packet import StreamWriter
@@ -13,8 +13,6 @@ from gsstream.player.playback import Playback
 from gsstream.serve.package import package
 
 pytestmark = needs_browser
-PLAYER = "document.querySelector('gsstream-player')?.player"
-READY = ["until", f"{PLAYER}?.state && {PLAYER}._target === null"]
 #: The sum of all values of a state: one number that tells states apart.
 SUM = f"Object.values({PLAYER}.state.scene).reduce((sum, values) => values.reduce((s, v) => s + v, sum), 0)"
 
@@ -57,8 +55,7 @@ def test_seeking_shows_the_right_frames(joined, tmp_path, fault):
         steps += [["evaluate", f"{PLAYER}.seek({frame})"], ["until", f"{PLAYER}.frame === {frame}"], ["evaluate", SUM]]
     steps += [["evaluate", f"{PLAYER}.problem"]]
     with serving(folder, **({"ranges": False} if fault == "ranges" else {})) as (url, server):
-        steps[0][1] = steps[0][1].replace("URL", url)
-        results, _ = try_in_browser(steps, tmp_path, size=(120, 90))
+        results, _ = try_in_browser(at(url, steps), tmp_path, size=(120, 90))
         asked = [path.rsplit("/", 1)[-1] for path, _ in server.requests]
     assert results[4:-1:3] == pytest.approx([sums[frame] for frame in order], rel=1e-9)
     assert results[-1] is None
@@ -71,8 +68,7 @@ def test_playing_through_needs_no_join(joined, tmp_path):
     folder, _ = joined
     steps = [["go", "URL/index.html?autoplay=1&loop=false"], ["until", f"{PLAYER}?.frame === 39"]]
     with serving(folder, ranges=False) as (url, server):
-        steps[0][1] = steps[0][1].replace("URL", url)
-        try_in_browser(steps, tmp_path, size=(120, 90))
+        try_in_browser(at(url, steps), tmp_path, size=(120, 90))
         asked = [path.rsplit("/", 1)[-1] for path, _ in server.requests]
     assert not [name for name in asked if name.endswith(".gsj")]
     assert len([name for name in asked if name.endswith(".gss")]) == 2, "each segment once, although sent whole"

@@ -74,13 +74,6 @@ def test_shrinking_is_the_exact_area_average(target: tuple[int, int]) -> None:
     np.testing.assert_allclose(shrink(pixels, target), expected, rtol=2e-6)
 
 
-def test_scaled_cameras_see_the_same_rays() -> None:
-    full, half = open_source("demo").info.train, open_source("demo", 0.5).info.train
-    assert (half.width, half.height) == (80, 60)
-    np.testing.assert_allclose(half.Ks[:, :2] * 2, full.Ks[:, :2])
-    np.testing.assert_array_equal(half.viewmats, full.viewmats)
-
-
 @pytest.mark.parametrize("scale", [0.0, -1.0, 1.5, math.nan])
 def test_scale_outside_its_range_is_refused(scale: float) -> None:
     with pytest.raises(SourceError, match=r"scale: expected a factor in \(0, 1\]"):
@@ -202,12 +195,6 @@ def test_wrong_size_transparency_and_late_loss_are_named(tmp_path: Path) -> None
     path.unlink()
     with pytest.raises(SourceError, match=r"0000\.png: the image is missing"):
         source.frame(0)
-
-
-@pytest.mark.parametrize("index", [-1, 2])
-def test_frames_outside_the_recording(tmp_path: Path, index: int) -> None:
-    with pytest.raises(SourceError, match=f"has no frame {index}; it has 2"):
-        MultiviewSource(make_recording(tmp_path / "r")).frame(index)
 
 
 def test_points_that_float32_rounds_far_from_the_origin_are_named(tmp_path: Path) -> None:

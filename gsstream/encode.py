@@ -138,7 +138,7 @@ def encoder_for(
     assembly = _assembled(method, settings, parts)
 
     def seeds(frame: Frame) -> Any:
-        return gather_points(source.points, frame, assembly.recipe.first_frame, info=source.info)
+        return gather_points(source, frame, assembly.recipe.first_frame)
 
     encoder = Encoder(assembly, source.info, seeds, callbacks=listeners)
     return encoder

@@ -63,7 +63,7 @@ class MethodUnderTest:
         source = open_source(uri)
         settings, parts = self.parts.recipe.first_frame, self.parts
         encoder = Encoder(
-            parts, source.info, lambda frame: gather_points(source.points, frame, settings),
+            parts, source.info, lambda frame: gather_points(source, frame, settings),
             first_frame=first,
         )  # fmt: skip
         return encoder

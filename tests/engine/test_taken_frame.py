@@ -33,7 +33,7 @@ def begun(method: str, settings: Mapping[str, Any] | None = None, first: PlayerS
         frame = source.frame(0)
 
         def seeds(given: Frame) -> PointCloud:
-            return gather_points(source.points, given, parts.recipe.first_frame)
+            return gather_points(source, given, parts.recipe.first_frame)
 
         return Encoder(parts, source.info, seeds, first_frame=first).encode(frame).state.player
 

@@ -41,7 +41,7 @@ def changed(scene: str, motion: str, first: PlayerState | None, frames: int) -> 
     source = open_recording(uri, parts.recipe, catalog)
     settings, held, found = parts.recipe.first_frame, HeldOut(parts.renderer), []
     encoder = Encoder(
-        parts, source.info, lambda frame: gather_points(source.points, frame, settings), first_frame=first
+        parts, source.info, lambda frame: gather_points(source, frame, settings), first_frame=first
     )
     for index in range(frames):
         frame = source.frame(index)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud, join_frames, shrink_frame
 from gsstream.core.signs import Tell, silent
 from gsstream.engine.fit import schedule
-from gsstream.input.recordings.base import FrameSource, PointKind, SourceInfo
+from gsstream.input.recordings.base import FrameSource
 from gsstream.input.recordings.depth_maps import read_depth_maps
 from gsstream.input.seeds.seeding import photo_consistent_seeds
 from gsstream.input.seeds.shell import shell_points
@@ -20,19 +18,16 @@ SPARSE = 2000
 SWEEP_WIDTH = 160
 
 
-def gather_points(
-    shipped: Callable[[PointKind], PointCloud | None], frame: Frame, settings: FirstFrame, tell: Tell = silent,
-    info: SourceInfo | None = None,
-) -> PointCloud:  # fmt: skip
+def gather_points(source: FrameSource | None, frame: Frame, settings: FirstFrame, tell: Tell = silent) -> PointCloud:
     """Return the points to seed from. Only the cameras of ``frame`` take part, and points that the source vouches for.
 
-    Where a plane sweep is made, it uses the recording's depth maps (``info.depth_maps``).
+    Where a plane sweep is made, it uses the recording's depth maps.
 
     Raises InputError when the recipe asks for a kind of points that the recording does not have, or finds none.
     """
     pixels = frame.images[..., 0].size
     limit = min(settings.max_points, max(1, pixels // schedule.PIXELS_PER_SEED))
-    return thin_points(_base_points(shipped, frame, settings, tell, info), limit)
+    return thin_points(_base_points(source, frame, settings, tell), limit)
 
 
 def with_test_views(source: FrameSource, frame: Frame) -> Frame:
@@ -43,16 +38,13 @@ def with_test_views(source: FrameSource, frame: Frame) -> Frame:
     return join_frames(frame, source.frame(frame.index, "test"))
 
 
-def _base_points(
-    ships: Callable[[PointKind], PointCloud | None], frame: Frame, settings: FirstFrame, tell: Tell,
-    info: SourceInfo | None,
-) -> PointCloud:  # fmt: skip
+def _base_points(source: FrameSource | None, frame: Frame, settings: FirstFrame, tell: Tell) -> PointCloud:
     wanted = settings.points
     if wanted == "sfm":
         return _triangulate(frame, tell)
     if wanted == "sweep":
-        return _sweep(frame, settings, tell, info)
-    shipped = ships("sparse" if wanted == "sparse" else "recording")
+        return _sweep(frame, settings, tell, source)
+    shipped = None if source is None else source.points("sparse" if wanted == "sparse" else "recording")
     if shipped is None and wanted != "auto":
         raise InputError(
             f"first_frame.points = {wanted!r}, but the recording ships no points, "
@@ -61,7 +53,7 @@ def _base_points(
     if shipped is not None and (wanted != "auto" or len(shipped) >= SPARSE):
         return shipped
     try:
-        return _sweep(frame, settings, tell, info)
+        return _sweep(frame, settings, tell, source)
     except InputError:  # fewer than three cameras, or views that agree nowhere
         if shipped is not None:
             return shipped
@@ -76,8 +68,10 @@ def _triangulate(frame: Frame, tell: Tell) -> PointCloud:
     return triangulate_points(frame.images, frame.cameras, tell=tell)
 
 
-def _sweep(frame: Frame, settings: FirstFrame, tell: Tell, info: SourceInfo | None) -> PointCloud:
+def _sweep(frame: Frame, settings: FirstFrame, tell: Tell, source: FrameSource | None) -> PointCloud:
     """Points that several training views agree on, found at most SWEEP_WIDTH pixels wide (time grows with pixels)."""
     small = shrink_frame(frame, -(-frame.cameras.width // SWEEP_WIDTH))
-    known = None if info is None else read_depth_maps(info.depth_maps, small.cameras, info.world.scale)
+    known = None
+    if source is not None:
+        known = read_depth_maps(source.info.depth_maps, small.cameras, source.info.world.scale)
     return photo_consistent_seeds(small.images, small.cameras, settings.max_points, known=known, tell=tell).points

@@ -185,7 +185,7 @@ class Encoder:
         return mean_color(frame.as_float32().images) if wanted == "auto" else wanted
 
     def _swept(self, frame: Frame) -> PointCloud:
-        return gather_points(lambda _: None, frame, self.parts.recipe.first_frame)
+        return gather_points(None, frame, self.parts.recipe.first_frame)
 
     def _meta(self, frame: Frame) -> StreamMeta:
         info, recipe = self.info, self.parts.recipe

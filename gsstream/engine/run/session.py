@@ -152,7 +152,7 @@ class _Run:
     def _seeds(self, frame: Frame) -> PointCloud:
         recipe = self.encoder.parts.recipe
         seen = with_test_views(self.source, frame) if recipe.data.leak == "points" else frame
-        points = gather_points(self.source.points, seen, recipe.first_frame, self.progress.tell, self.source.info)
+        points = gather_points(self.source, seen, recipe.first_frame, self.progress.tell)
         self.seeded = points.origin
         return points
 

@@ -58,7 +58,7 @@ def captured(method: str, settings: tuple[str, ...]) -> tuple[Assembly, Problem]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(frame_step, "optimise", noted)
         encoder = Encoder(
-            parts, source.info, lambda frame: gather_points(source.points, frame, parts.recipe.first_frame)
+            parts, source.info, lambda frame: gather_points(source, frame, parts.recipe.first_frame)
         )
         for index in range(3):
             encoder.encode(source.frame(index))

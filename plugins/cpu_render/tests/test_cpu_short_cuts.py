@@ -48,7 +48,7 @@ def test_every_frame_takes_the_short_cut_unless_each_step_is_checked(
     resolved = resolve_recipe(method, catalog.recipe_path, (), [("the test", text) for text in SETTINGS])
     parts, source = assemble(resolved, catalog, level), open_source(SOURCE)
     encoder = Encoder(
-        parts, source.info, lambda frame: gather_points(source.points, frame, parts.recipe.first_frame)
+        parts, source.info, lambda frame: gather_points(source, frame, parts.recipe.first_frame)
     )
     for index in range(3):
         encoder.encode(source.frame(index))

@@ -94,7 +94,7 @@ def test_depth_is_in_the_units_of_the_poses(tmp_path: Path, monkeypatch: pytest.
     found = []
     for unit in (1.0, 1e-3, 0.3048):
         source = to_rig_coordinates(open_source(str(write(tmp_path / f"{unit}", unit))))
-        seeds = gather_points(source.points, source.frame(0), FirstFrame(), info=source.info)
+        seeds = gather_points(source, source.frame(0), FirstFrame())
         assert seeds.origin.startswith("depth maps of 3 cameras")
         found.append(source.info.world.points(seeds.xyz) * unit)
     away = np.abs(np.linalg.norm(found[0] - BALL, axis=1) - RADIUS)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
@@ -37,8 +38,8 @@ def read_quantity(text: str, units: dict[str, float]) -> float:
     return value
 
 
-def _seconds(value: Any) -> Any:
-    return read_quantity(value, SECONDS) if isinstance(value, str) else value
+def _number(units: dict[str, float]) -> Callable[[Any], Any]:
+    return lambda value: read_quantity(value, units) if isinstance(value, str) else value
 
 
 def _bytes(value: Any) -> Any:
@@ -54,17 +55,13 @@ def _packet(value: Any) -> Any:
     return size
 
 
-def _bits(value: Any) -> Any:
-    return read_quantity(value, BITS) if isinstance(value, str) else value
-
-
 def _text(units: dict[str, float]) -> Any:
     """What a schema knows of the text: number and unit."""
     return Annotated[str, Field(pattern=rf"^\s*\+?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?\s*({'|'.join(units)})?\s*$")]
 
 
 Seconds = Annotated[
-    float, BeforeValidator(_seconds, json_schema_input_type=Annotated[float, Field(gt=0)] | _text(SECONDS))
+    float, BeforeValidator(_number(SECONDS), json_schema_input_type=Annotated[float, Field(gt=0)] | _text(SECONDS))
 ]
 Packet = Annotated[
     int, BeforeValidator(_packet, json_schema_input_type=Annotated[float, Field(ge=MIN_SIZE)] | _text(BYTES))
@@ -72,7 +69,7 @@ Packet = Annotated[
 Memory = Annotated[int, BeforeValidator(_bytes, json_schema_input_type=Annotated[float, Field(ge=1)] | _text(BYTES))]
 
 
-Rate = Annotated[float, BeforeValidator(_bits, json_schema_input_type=Annotated[float, Field(gt=0)] | _text(BITS))]
+Rate = Annotated[float, BeforeValidator(_number(BITS), json_schema_input_type=Annotated[float, Field(gt=0)] | _text(BITS))]
 
 
 class Budget(BaseModel):

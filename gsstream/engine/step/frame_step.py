@@ -10,9 +10,10 @@ from typing import NamedTuple
 
 import torch
 
-from gsstream.core.changes import Delta, apply_delta
+from gsstream.core.changes import Delta, Scene, apply_delta, sent_rows
 from gsstream.core.deferred import deferred_checks
 from gsstream.core.frame import Frame
+from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.log import FrameLog
 from gsstream.core.rng import Rng
@@ -23,10 +24,9 @@ from gsstream.engine.assembly.guard import error_context
 from gsstream.engine.budget.controller import usage
 from gsstream.engine.budget.epoch_scheduler import scheduled
 from gsstream.engine.fit.frame_images import FrameImages
-from gsstream.engine.state.stream_state import Step, StreamState, next_state
+from gsstream.engine.state.stream_state import Resident, Step, StreamState, next_state, updated
 from gsstream.engine.step.active.candidates import CHANGE_VOTES, candidates
 from gsstream.engine.step.active.change_on_device import find_change
-from gsstream.engine.step.commit import keep
 from gsstream.engine.step.context import EngineContext
 from gsstream.engine.step.metrics import log_packet, step_numbers
 from gsstream.engine.step.motion import propose_motion
@@ -34,8 +34,9 @@ from gsstream.engine.step.optimise import optimise
 from gsstream.engine.step.problem import Problem
 from gsstream.engine.step.quantise import encode_frame, quantise_residual
 from gsstream.method.tools import Tools
-from gsstream.packet import decode_packet, encode_empty
+from gsstream.packet import PlayerState, decode_packet, encode_empty
 from gsstream.parts.growth.none import NoGrowth
+from gsstream.parts.render.base import RenderSession
 from gsstream.parts.update.base import Scope
 
 
@@ -133,3 +134,40 @@ def select(parts: Assembly, view: EngineContext, hierarchy: Hierarchy, scope: Sc
     open_probability = parts.gate.open_probability(logits)
     able = seen.changed_rows(CHANGE_VOTES)
     return Selected(candidates(able, open_probability, hierarchy, parts.recipe.stream.active_threshold), logits)
+
+
+#: Share of the rows that a frame may change where what the renderer keeps of the others pays.
+MOST_CHANGED = 0.5
+
+
+def keep(
+    view: EngineContext, scene: Scene, delta: Delta, player: PlayerState
+) -> tuple[RenderSession | None, Resident | None]:
+    """Return what of a frame stays with the renderer, and on its device; nothing where :func:`commit_session` says so.
+
+    Where the frame changed nothing, the images that the scene shows stay those of the frame before.
+    """
+    found = commit_session(view, scene, delta, player)
+    if found is None:
+        return None, None
+    if view.images.device.type == "cpu":
+        return found[0], None
+    return found[0], Resident(found[1], view.hierarchy, view.previous_images if delta.is_empty else view.images)
+
+
+def commit_session(
+    view: EngineContext, scene: Scene, delta: Delta, player: PlayerState
+) -> tuple[RenderSession, Gaussians[torch.Tensor]] | None:
+    """Return the session of the decoded scene, with what did not change still projected, and the scene itself.
+
+    None where keeping costs more than it saves: rows came or went, or most of them changed.
+    """
+    if delta.has_row_edit:
+        return None
+    if delta.is_empty and scene.gaussians is not player.gaussians:
+        return None  # not even the motions were sent: the decoded scene is the one before them
+    rows = sent_rows(scene.layout, delta.gates(scene.layout))
+    if len(rows) > MOST_CHANGED * len(player.gaussians):
+        return None
+    gaussians = updated(view.gaussians, player.gaussians, rows)
+    return view.session.commit(gaussians, torch.from_numpy(rows).to(gaussians.means.device)), gaussians

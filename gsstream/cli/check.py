@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gsstream.core.errors import InputError, PluginUnavailable
+from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
 
 if TYPE_CHECKING:
     from gsstream.plugins.catalog import Catalog
@@ -162,7 +162,6 @@ def _entries(catalog: Catalog, name: str) -> list[tuple[str, str]]:
 
     Raises PluginUnavailable when it is in quarantine, UnknownName when nothing is called so.
     """
-    from gsstream.core.errors import UnknownName
     from gsstream.spec import KINDS
 
     kind, _, part = name.rpartition("/")

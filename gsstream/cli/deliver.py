@@ -9,7 +9,7 @@ import typer
 
 from gsstream.cli.listing import plural
 from gsstream.cli.streams import Frames, MaxMemory, Stream, fail_with, frame_range, progress_on, size_of, stream_file
-from gsstream.core.errors import InputError
+from gsstream.core.errors import InputError, OutputError
 
 
 def export(
@@ -82,7 +82,6 @@ def _page(stream: Path, out: Path, renditions: list[Path], join_every: float) ->
 
 
 def _manifest(stream: Path, out: Path) -> Path:
-    from gsstream.core.errors import OutputError
     from gsstream.player.manifest import manifest_json
 
     text, target = manifest_json(stream), out / "stream.json"

@@ -20,6 +20,7 @@ import typer
 
 from gsstream import API_VERSION, __version__
 from gsstream.cli.listing import plural, printable
+from gsstream.core.errors import GsstreamError
 from gsstream.core.needs import install_extra
 from gsstream.core.processors import processors
 
@@ -113,7 +114,6 @@ def _torch() -> str:
 def _encoder() -> str:
     if "torch" not in sys.modules:
         return "nothing: torch is missing"
-    from gsstream.core.errors import GsstreamError
     from gsstream.engine.assembly.choose_renderer import SlowRendererWarning, choose_renderer
     from gsstream.plugins.catalog import load_catalog
 

@@ -21,9 +21,9 @@ from gsstream.cli.streams import (
     size_of,
     stream_file,
 )
+from gsstream.core.errors import InputError, PacketError
 
 if TYPE_CHECKING:
-    from gsstream.core.errors import PacketError
     from gsstream.evaluation.evaluate import Evaluation
     from gsstream.metrics import OnnxLpips
 
@@ -97,8 +97,6 @@ def evaluate(
 
 def _check(stream: Path | None, source: str | None, other: Elsewhere) -> None:
     """Refuse options that would do nothing. Raises InputError."""
-    from gsstream.core.errors import InputError
-
     if sum(given is not None for given in (stream, other.ply_sequence, other.renders)) != 1:
         raise InputError("expected one of STREAM, --ply-sequence DIR and --renders DIR, to say what is evaluated")
     if stream is None and source is None:
@@ -108,7 +106,6 @@ def _check(stream: Path | None, source: str | None, other: Elsewhere) -> None:
 
 
 def _lpips(file: Path | None, lower: str | None) -> OnnxLpips | None:
-    from gsstream.core.errors import InputError
     from gsstream.metrics import OnnxLpips
 
     if lower is not None and file is None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gsstream.cli.listing import table
+from gsstream.core.errors import InputError
 from gsstream.core.kinds import METHOD_SLOTS
 
 if TYPE_CHECKING:
@@ -22,8 +23,6 @@ def methods(
     ] = False,
 ) -> None:
     """List the methods that --method may name, or show one."""
-    from gsstream.core.errors import InputError
-
     if name is not None:
         _show(name, full)
         return

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gsstream.cli.listing import plural, table
+from gsstream.core.errors import GsstreamError, PluginUnavailable, UnknownName
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -57,7 +58,6 @@ def _plugin_rows(catalog: Catalog) -> Iterator[tuple[str, str, str]]:
 
 def _check(catalog: Catalog) -> bool:
     """Resolve everything; print one line per failure."""
-    from gsstream.core.errors import PluginUnavailable
     from gsstream.spec import MethodSpec
 
     failures = []
@@ -76,7 +76,6 @@ def _check(catalog: Catalog) -> bool:
 
 
 def _show(part: str) -> None:
-    from gsstream.core.errors import UnknownName
     from gsstream.plugins.catalog import load_catalog
     from gsstream.spec import KINDS
 
@@ -114,7 +113,6 @@ def _describe(catalog: Catalog, kind: str, name: str, entry: Entry) -> str:
 
 def _users(catalog: Catalog, kind: str, name: str) -> Iterator[tuple[str, str, str, str]]:
     """(method, key, value, who set it) of every method that uses a part; methods that cannot be read are left out."""
-    from gsstream.core.errors import GsstreamError
     from gsstream.recipe.load import resolve_recipe
 
     for method in catalog.names("method"):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gsstream.cli import options
+from gsstream.core.errors import InputError, PluginUnavailable
 
 if TYPE_CHECKING:
     from gsstream.plugins.catalog import Catalog
@@ -31,7 +32,6 @@ def recipe(
     With --schema: keys, ranges, meanings, and the settings of every installed part. An editor with a YAML language
     server uses a file with it when the first line of a recipe says "# yaml-language-server: $schema=FILE".
     """
-    from gsstream.core.errors import InputError
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
     from gsstream.recipe.save import to_yaml
@@ -64,7 +64,6 @@ def _schema(method: str | None, catalog: Catalog) -> str:
 
 def _part_schemas(catalog: Catalog) -> dict[str, dict[str, PartSchema]]:
     """Every part that a recipe may name, imported; those that cannot be are named without their settings."""
-    from gsstream.core.errors import PluginUnavailable
     from gsstream.recipe.schema import PartSchema, slots
 
     found: dict[str, dict[str, PartSchema]] = {slot: {} for slot in slots()}

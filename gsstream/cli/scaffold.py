@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 import gsstream
+from gsstream.core.errors import InputError, OutputError, UnknownName
 from gsstream.core.kinds import PART_KINDS
 from gsstream.core.needs import pip
 
@@ -25,7 +26,6 @@ def new_plugin(
     out: Annotated[Path | None, typer.Option("--out", help="Folder to write; by default gsstream-NAME.")] = None,
 ) -> None:
     """Write a distribution with one working part, its test and README."""
-    from gsstream.core.errors import InputError, OutputError, UnknownName
     from gsstream.plugins.catalog import load_catalog
 
     if not re.fullmatch(r"[a-z][a-z0-9_-]*", name):

@@ -9,6 +9,7 @@ import typer
 
 from gsstream.cli import options
 from gsstream.cli.working import working
+from gsstream.core.errors import InputError
 from gsstream.core.needs import page
 
 app = typer.Typer(
@@ -90,7 +91,6 @@ def validate(
     ] = False,
 ) -> None:
     """Say what is wrong with a scene, and what to do. Exit code 2 when a run would be wasted on it."""
-    from gsstream.core.errors import InputError
     from gsstream.engine.run.recording import open_recording
     from gsstream.input.prepare.findings import CHECKS
     from gsstream.input.prepare.validate import validate as find

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gsstream.cli.listing import plural
+from gsstream.core.errors import InputError, PacketError
+from gsstream.core.names import child
 
 if TYPE_CHECKING:
-    from gsstream.core.errors import PacketError
     from gsstream.packet import StreamMeta
     from gsstream.player.playback import Playback
     from gsstream.plugins.catalog import Catalog
@@ -80,8 +81,6 @@ def play(
 
 def stream_file(path: Path) -> Path:
     """Return the stream file meant by ``path``. Raises InputError when there is none, naming what was looked for."""
-    from gsstream.core.errors import InputError
-
     file = path / "stream.gss" if path.is_dir() else path
     if not file.is_file():
         raise InputError(f"no stream at {file}: expected a .gss file or the output folder of a run")
@@ -90,15 +89,11 @@ def stream_file(path: Path) -> Path:
 
 def _one_of_many(out: Path, camera: str) -> Path:
     """Several cameras make one file or folder each, named after the camera."""
-    from gsstream.core.names import child
-
     return child(out.parent, f"{out.stem}-{camera}{out.suffix}") if out.suffix else child(out, camera)
 
 
 def _cameras(playback: Playback, wanted: str | None) -> list[str | None]:
     """Ids meant by --camera; None is the player's own choice."""
-    from gsstream.core.errors import InputError
-
     train, test = list(playback.meta.train.ids), list(playback.meta.test.ids)
     groups: dict[str | None, list[str]] = {"train": train, "test": test, "all": train + test}
     found = groups.get(wanted)
@@ -115,8 +110,6 @@ def named_recording(file: Path, meta: StreamMeta, catalog: Catalog) -> str:
     Folders, the demo and synthetic scenes are read as they are. What waits (watch:) or is opened by a plugin is only
     opened when the user names it. Raises InputError.
     """
-    from gsstream.core.errors import InputError
-
     uri = str(meta.extra.get("source_uri", ""))
     if not uri:
         raise InputError(f"{file} does not say which recording it was made from; name it with --source")
@@ -134,8 +127,6 @@ def named_recording(file: Path, meta: StreamMeta, catalog: Catalog) -> str:
 
 def check_recipe(file: Path, recipe: Mapping[str, Any]) -> None:
     """Refuse a recipe in a stream whose scale or seed no run can have had. Raises InputError."""
-    from gsstream.core.errors import InputError
-
     scale, seed = recipe.get("scale", 1.0), recipe.get("seed", 0)
     if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0 < scale <= 1:
         raise InputError(f"{file}: its recipe says scale = {str(scale)[:40]!r}; expected a factor in (0, 1]")
@@ -151,8 +142,6 @@ def fail_with(damage: PacketError | None) -> None:
 
 def frame_range(text: str | None) -> tuple[int | None, int | None]:
     """Return A and B of "A:B"; None where one is left out."""
-    from gsstream.core.errors import InputError
-
     match = re.fullmatch(r"(\d*):(\d*)", ":" if text is None else text)
     first, last = (int(number) if number else None for number in match.groups()) if match else (0, 0)
     if last is not None and last <= (first or 0):
@@ -162,8 +151,6 @@ def frame_range(text: str | None) -> tuple[int | None, int | None]:
 
 def picture_size(text: str | None) -> tuple[int, int] | None:
     """Return (width, height) meant by ``--size``; None: that of the camera. Raises InputError."""
-    from gsstream.core.errors import InputError
-
     if text is None:
         return None
     match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
@@ -175,7 +162,6 @@ def picture_size(text: str | None) -> tuple[int, int] | None:
 
 def size_of(text: str | None) -> int | None:
     """Return the bytes meant by ``--max-memory``; None: no limit."""
-    from gsstream.core.errors import InputError
     from gsstream.recipe.budget import BYTES, read_quantity
 
     if text is None:

@@ -67,9 +67,9 @@ Packet = Annotated[
     int, BeforeValidator(_packet, json_schema_input_type=Annotated[float, Field(ge=MIN_SIZE)] | _text(BYTES))
 ]
 Memory = Annotated[int, BeforeValidator(_bytes, json_schema_input_type=Annotated[float, Field(ge=1)] | _text(BYTES))]
-
-
-Rate = Annotated[float, BeforeValidator(_number(BITS), json_schema_input_type=Annotated[float, Field(gt=0)] | _text(BITS))]
+Rate = Annotated[
+    float, BeforeValidator(_number(BITS), json_schema_input_type=Annotated[float, Field(gt=0)] | _text(BITS))
+]
 
 
 class Budget(BaseModel):

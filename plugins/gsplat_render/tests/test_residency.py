@@ -18,7 +18,7 @@ from resident import CPU, DEVICE, method_on
 from gsstream.core.errors import ComponentError
 from gsstream.core.frame import Frame
 from gsstream.engine.frame0.optimise import FirstFrameRun
-from gsstream.engine.step import commit
+from gsstream.engine.step import frame_step
 from gsstream.input.recordings.open import open_source
 from gsstream.parts.loss.photometric import ReferenceLoss
 from gsstream.parts.motion.newton import DampedNewton
@@ -145,7 +145,7 @@ def test_one_copy_or_one_value_that_is_read_is_counted(
 def test_where_little_changes_the_scene_stays_there_and_only_what_changed_crosses(
     frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(commit, "MOST_CHANGED", 1.0)  # of so few Gaussians, any change reaches more than half
+    monkeypatch.setattr(frame_step, "MOST_CHANGED", 1.0)  # of so few Gaussians, any change reaches more than half
     images = [frames[0].images.copy() for _ in range(2)]
     for place, image in enumerate(images):
         image[:, 4:10, 4 + 2 * place : 10 + 2 * place] = 0.1

@@ -12,6 +12,7 @@ import typer
 
 from gsstream.cli import options
 from gsstream.cli.grouped import grouped
+from gsstream.core.errors import InputError
 
 app = typer.Typer(
     help="Measure rendering or a frame step here.", rich_markup_mode=None, no_args_is_help=True, add_completion=False
@@ -92,7 +93,6 @@ def frame(
     moves. Three variants of the recipe: dense (every gate open, everything takes part), gated (its own gates), active
     (and only what changed beyond the noise takes part: stream.change_threshold, 4 where the recipe has none).
     """
-    from gsstream.core.errors import InputError
     from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
 
@@ -166,8 +166,6 @@ def _percent(option: str, text: str, least: float) -> tuple[float, ...]:
 
 
 def _wrong(option: str, wanted: str, got: str) -> Exception:
-    from gsstream.core.errors import InputError
-
     return InputError(f"{option}: expected {wanted}, got {got!r}")
 
 

@@ -11,6 +11,7 @@ import typer
 from gsstream.cli import options
 from gsstream.cli.grouped import grouped
 from gsstream.cli.listing import plural
+from gsstream.core.errors import InputError
 from gsstream_lab.commands.options import RecordingOptions, WorkerOptions, progress
 
 
@@ -36,8 +37,6 @@ class Equal:
 
     def numbers(self) -> tuple[list[int], list[float]]:
         """Return what --epochs and --seconds say. Raises InputError for one that means nothing here."""
-        from gsstream.core.errors import InputError
-
         for option, text, where in (("--epochs", self.epochs, "epochs"), ("--seconds", self.seconds, "time")):
             if text is not None and self.at != where:
                 raise InputError(f"{option} {text} belongs to --at {where}, got --at {self.at}")
@@ -93,8 +92,6 @@ def compare(
 
 
 def _numbers(text: str | None, option: str, least: float, kind: type = float) -> list[float]:
-    from gsstream.core.errors import InputError
-
     try:
         found = [] if text is None else [kind(part) for part in text.split(",")]
     except ValueError:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gsstream.cli.streams import check_recipe, named_recording, progress_on, stream_file
+from gsstream.core.errors import InputError
 
 if TYPE_CHECKING:
     from gsstream_lab.gap.fresh import FreshFrames
@@ -43,7 +44,6 @@ def gap(
     contact sheet shows both close up. Give enough passes: below about 150, a fresh reconstruction may be worse than the
     cameras allow, and the gap too small.
     """
-    from gsstream.core.errors import InputError
     from gsstream.engine.run.output import write_whole
     from gsstream.engine.run.recording import open_recording
     from gsstream.evaluation.gallery import write_sheet
@@ -101,8 +101,6 @@ def _counter() -> Callable[[int, int, int], None]:
 
 def _frames(text: str, there: range) -> list[int]:
     """The frames meant by --at, in order, each once."""
-    from gsstream.core.errors import InputError
-
     try:
         found = sorted({int(part) for part in text.split(",")})
     except ValueError:

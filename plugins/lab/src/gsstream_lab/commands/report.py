@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from gsstream.cli.listing import plural
+from gsstream.core.errors import UnknownName
 
 
 def report(
@@ -31,7 +32,6 @@ def report(
     Pareto fronts, what each knob buys, all recipes with their spread over seeds, curves over frames; the paper's
     numbers beside ours where the sweep names a table of it. Everything is computed from the table.
     """
-    from gsstream.core.errors import UnknownName
     from gsstream.core.needs import require_encoder
     from gsstream_lab.report.groups import read_sweep_data
 

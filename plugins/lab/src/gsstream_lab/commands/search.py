@@ -9,6 +9,7 @@ import typer
 
 from gsstream.cli import options
 from gsstream.cli.grouped import grouped
+from gsstream.core.errors import InputError
 from gsstream_lab.commands.options import RecordingOptions, WorkerOptions, progress
 
 FOUND = "found.yaml"
@@ -63,7 +64,6 @@ def search(
 
 def _ladders(tried: list[str] | None) -> dict[str, tuple[Any, ...]]:
     """Key -> values of --try. Raises RecipeError or InputError."""
-    from gsstream.core.errors import InputError
     from gsstream.recipe.document import read_override
 
     out: dict[str, tuple[Any, ...]] = {}

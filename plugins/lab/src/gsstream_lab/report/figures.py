@@ -130,7 +130,12 @@ def _panel(axis: Any, groups: Sequence[Group], good: str, cost: str, looks: dict
         axis.plot(*front[at], "o", markersize=13, markerfacecolor="none", markeredgecolor="#444444")
     if math.isfinite(noise):
         axis.set_title(f"noise between seeds {noise:.3f} dB", fontsize=7, loc="right", color="#666666")
-    if max(x for x, _ in points) > 8 * min(x for x, _ in points) > 0:
+    style(axis, logarithmic=max(x for x, _ in points) > 8 * min(x for x, _ in points) > 0)
+
+
+def style(axis: Any, *, logarithmic: bool) -> None:
+    """Give a panel the look of all panels of a report."""
+    if logarithmic:
         axis.set_xscale("log")
         axis.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axis.xaxis.set_minor_formatter(NullFormatter())

@@ -106,10 +106,9 @@ def _range(curve: Curve, key: str) -> str:
 def _figure(axis: str, curves: Sequence[Curve]) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-    from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
     from gsstream.evaluation.plots import COLORS
-    from gsstream_lab.report.figures import png
+    from gsstream_lab.report.figures import png, style
 
     shown = [q for q in DRAWN_QUALITIES if any(math.isfinite(g.mean(q)) for curve in curves for g in curve.groups)]
     figure = Figure(figsize=(4.2 * len(shown), 3.8), dpi=100, layout="constrained")
@@ -119,14 +118,9 @@ def _figure(axis: str, curves: Sequence[Curve]) -> bytes:
             points = sorted((group.mean("kb"), group.mean(quality)) for group in curve.groups)
             panel.plot(*zip(*points, strict=True), "o-", markersize=4, linewidth=1.2,
                        color=COLORS[place % len(COLORS)], label=curve.name)  # fmt: skip
-        panel.set_xscale("log")
-        panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        panel.xaxis.set_minor_formatter(NullFormatter())
+        style(panel, logarithmic=True)
         panel.set_xlabel(BY_KEY["kb"].title, fontsize=9)
         panel.set_title(BY_KEY[quality].title, fontsize=9, loc="left")
-        panel.grid(color="#e5e5e5", linewidth=0.6)
-        panel.spines[["top", "right"]].set_visible(False)
-        panel.tick_params(labelsize=8)
     figure.legend(*panel.get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9, frameon=False)
     figure.suptitle(f"curves over {axis}", fontsize=10, x=0.01, ha="left")
     return png(figure)

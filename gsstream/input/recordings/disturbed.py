@@ -15,11 +15,9 @@ import re
 from dataclasses import replace
 from typing import Any
 
-from pydantic import ValidationError
-
 from gsstream.core.errors import SourceError, suggest
 from gsstream.input.recordings.base import FrameSource, SourceInfo
-from gsstream.input.recordings.options import DataOptions, Disturbances
+from gsstream.input.recordings.options import DataOptions, Disturbances, validated
 from gsstream.input.recordings.transformed import TransformedSource
 
 _KEYS = ("seed", *Disturbances.model_fields)
@@ -43,13 +41,7 @@ def parse_disturbances(text: str) -> tuple[Disturbances, int]:
     seed = str(values.pop("seed", "0"))
     if not re.fullmatch(r"\d{1,9}", seed):
         raise SourceError(f"disturbed source: seed: expected a whole number from 0, got {seed!r}")
-    try:
-        return Disturbances.model_validate(values), int(seed)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = str(first["loc"][0])
-        meaning = Disturbances.model_fields[key].description
-        raise SourceError(f"disturbed source: {key} = {first['input']!r}: {first['msg']} ({meaning})") from error
+    return validated(Disturbances, values, "disturbed source"), int(seed)
 
 
 class DisturbedSource(TransformedSource):

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal, TypeVar
+from urllib.parse import parse_qsl
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from gsstream.core.errors import SourceError, suggest
 from gsstream.core.storage import Storage
+
+Options = TypeVar("Options", bound=BaseModel)
 
 Leak = Literal["none", "points", "training"]
 LostImage = Literal["hold", "black"]
@@ -89,3 +94,30 @@ class DataOptions(BaseModel):
     def touches_nothing(self) -> bool:
         """Whether the recording passes as it is."""
         return self == DataOptions()
+
+
+def options_of_query(model: type[Options], query: str, source: str) -> Options:
+    """Read ``"key=value&key=value"``. Raises SourceError naming one that is unknown, given twice or out of range."""
+    known = ", ".join(model.model_fields)
+    try:
+        pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
+    except ValueError as error:
+        raise SourceError(f"{source}: expected key=value&key=value, got {query!r}; keys: {known}") from error
+    keys = [key for key, _ in pairs]
+    for key in keys:
+        if key not in model.model_fields:
+            raise SourceError(f"{source}: unknown option {key!r}{suggest(key, model.model_fields)}; all: {known}")
+        if keys.count(key) > 1:
+            raise SourceError(f"{source}: option {key!r} is given more than once in {query!r}")
+    return validated(model, dict(pairs), source)
+
+
+def validated(model: type[Options], values: Mapping[str, Any], source: str) -> Options:
+    """Return the options with these values. Raises SourceError naming one that is out of range, and what it means."""
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = str(first["loc"][0])
+        meaning = model.model_fields[name].description
+        raise SourceError(f"{source}: option {name!r} = {first['input']!r}: {first['msg']} ({meaning})") from error

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from urllib.parse import parse_qsl
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.errors import SourceError, suggest
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.input.recordings.base import PointKind, SourceInfo, Split, check_index
 from gsstream.input.recordings.multiview import scaled_size
+from gsstream.input.recordings.options import options_of_query
 from gsstream.input.recordings.primitives import Hits, Placed, cast, lit
 from gsstream.input.recordings.toyroom import LIGHT, arc_cameras
 from gsstream.input.recordings.toyscenes import SceneName, ToyScene
@@ -77,29 +76,7 @@ class SyntheticSource:
     def from_query(cls, query: str, *, scale: float = 1.0, uri: str | None = None) -> SyntheticSource:
         """Build from ``"frames=40&views=8"``. Raises SourceError naming the option that is unknown or out of range.
         """
-        known = ", ".join(SyntheticOptions.model_fields)
-        try:
-            pairs = parse_qsl(query.lstrip("?"), keep_blank_values=True, strict_parsing=bool(query.lstrip("?")))
-        except ValueError as error:
-            raise SourceError(
-                f"synthetic source: expected key=value&key=value, got {query!r}; keys: {known}"
-            ) from error
-        keys = [key for key, _ in pairs]
-        for key in keys:
-            if key not in SyntheticOptions.model_fields:
-                near = suggest(key, SyntheticOptions.model_fields)
-                raise SourceError(f"synthetic source: unknown option {key!r}{near}; all: {known}")
-            if keys.count(key) > 1:
-                raise SourceError(f"synthetic source: option {key!r} is given more than once in {query!r}")
-        try:
-            options = SyntheticOptions.model_validate(dict(pairs))
-        except ValidationError as error:
-            first = error.errors()[0]
-            name = str(first["loc"][0])
-            meaning = SyntheticOptions.model_fields[name].description
-            raise SourceError(
-                f"synthetic source: option {name!r} = {first['input']!r}: {first['msg']} ({meaning})"
-            ) from error
+        options = options_of_query(SyntheticOptions, query.lstrip("?"), "synthetic source")
         return cls(options, scale=scale, uri=f"synthetic:{query}" if uri is None else uri)
 
     @property

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from typing import Literal
-from urllib.parse import parse_qsl
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from gsstream.core.errors import SourceError, suggest
+from gsstream.input.recordings.options import options_of_query
 
 
 class WatchOptions(BaseModel):
@@ -41,19 +40,4 @@ class WatchOptions(BaseModel):
     @classmethod
     def from_query(cls, query: str) -> WatchOptions:
         """Read ``"timeout=10&behind=drop"``. Raises SourceError naming an unknown or impossible option."""
-        known = ", ".join(cls.model_fields)
-        try:
-            pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
-        except ValueError as error:
-            raise SourceError(f"watch source: expected key=value&key=value, got {query!r}; keys: {known}") from error
-        for key, _value in pairs:
-            if key not in cls.model_fields:
-                raise SourceError(f"watch source: unknown option {key!r}{suggest(key, cls.model_fields)}; all: {known}")
-        try:
-            return cls.model_validate(dict(pairs))
-        except ValidationError as error:
-            first = error.errors()[0]
-            name = str(first["loc"][0])
-            given = f"option {name!r} = {first['input']!r}"
-            meaning = cls.model_fields[name].description
-            raise SourceError(f"watch source: {given}: {first['msg']} ({meaning})") from error
+        return options_of_query(cls, query, "watch source")

@@ -75,7 +75,7 @@ FAULTS = {
     "disturbed:gian=1:demo": "did you mean 'gain'",
     "disturbed:gain:demo": "expected KEY=VALUE",
     "disturbed:gain=9:demo": "less than or equal to 4.*factor on all images",
-    "disturbed:gain=x:demo": "gain = 'x'",
+    "disturbed:gain=x:demo": "option 'gain' = 'x'",
     "disturbed:gain=1,gain=2:demo": "given twice",
     "disturbed:seed=-1:demo": "expected a whole number",
     "disturbed:lost_cameras=cam03:demo": "expected ID@A-B",

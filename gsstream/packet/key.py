@@ -22,8 +22,7 @@ from gsstream.packet.base import (
     expect,
     most_gaussians,
 )  # fmt: skip
-from gsstream.packet.bits import pack_blobs, unpack_blobs
-from gsstream.packet.bulk import compress, decompress
+from gsstream.packet.bits import compress, decompress, pack_blobs, unpack_blobs
 from gsstream.packet.layers import ORDER, decode_layers, in_layers
 from gsstream.packet.meta import StreamMeta, meta_from_json, meta_to_json
 from gsstream.packet.rows import decode_rows, decoded_rows, encode_rows, row_codes

@@ -29,8 +29,7 @@ from gsstream.packet.base import (
     parse_header,
     split_sections,
 )  # fmt: skip
-from gsstream.packet.bits import pack_blobs, unpack_blobs
-from gsstream.packet.bulk import decompress
+from gsstream.packet.bits import decompress, pack_blobs, unpack_blobs
 from gsstream.packet.grids import KEY_BITS
 from gsstream.packet.meta import StreamMeta, meta_from_json
 from gsstream.packet.positions import floor_exponent

@@ -13,10 +13,10 @@ from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.shapes import IntArray
 from gsstream.packet.base import MAX_GAUSSIANS, PacketKind, Section
 from gsstream.packet.bits import unpack_blobs
+from gsstream.packet.changes.residual import decode_pattern
 from gsstream.packet.changes.rows import HEAD_PARTS, decode_added
 from gsstream.packet.gates import decode_gates, run_tokens
 from gsstream.packet.layers import read_head
-from gsstream.packet.pattern import decode_pattern
 from gsstream.packet.symbols import decode_symbols
 
 _KEY_HEAD, _DELTA_HEAD, _MEANS_HEAD, _LAYOUT_HEAD = 2, 6, 3, 9

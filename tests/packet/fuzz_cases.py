@@ -13,7 +13,7 @@ from packet_scenes import decode_all, make_field_packets, make_moving_packets, m
 from gsstream.core.gaussians import Gaussians
 from gsstream.packet import EncodedPacket, PacketKind
 from gsstream.packet.base import PACKET_HEADER, SECTION_HEADER, SECTION_IDS, build_packet, file_header, parse_packet
-from gsstream.packet.bulk import compress, decompress
+from gsstream.packet.bits import compress, decompress
 from gsstream.packet.reader import index_body
 
 _LIES = (0, 1, 2, 127, 255, 1 << 15, 0xFFFF, 1 << 20, 4_000_000, 1 << 30, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)

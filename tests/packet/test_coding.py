@@ -12,8 +12,7 @@ from packet_scenes import make_delta, make_key, replaced
 from gsstream.core.changes import Delta, Residual, Scene
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.packet import decode_delta, encode_delta
-from gsstream.packet.bits import BitReader, BitWriter, pack_blobs, unpack_blobs
-from gsstream.packet.bulk import compress, decompress
+from gsstream.packet.bits import BitReader, BitWriter, compress, decompress, pack_blobs, unpack_blobs
 from gsstream.packet.gates import decode_gates, encode_gates
 from gsstream.packet.symbols import _histogram, decode_symbols, encode_symbols
 

@@ -13,7 +13,7 @@ from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.packet import PlayerState
-from gsstream.packet.bulk import decompress
+from gsstream.packet.bits import decompress
 from gsstream.serve.joins import MAGIC, VERSION, _bits, _origin
 
 _HEADER = 24

@@ -17,7 +17,7 @@ from node_runs import needs_node, node, play_in_node
 from gsstream.core.errors import PacketError
 from gsstream.packet import decode_packet
 from gsstream.packet.base import file_header
-from gsstream.packet.bulk import compress, decompress
+from gsstream.packet.bits import compress, decompress
 from gsstream.packet.symbols import encode_symbols
 
 pytestmark = needs_node

@@ -20,7 +20,7 @@ from gsstream.input.recordings.calibration import CALIBRATION_FILE, Calibration,
 from gsstream.input.recordings.depth_maps import FOLDER
 from gsstream.input.recordings.images import read_image
 from gsstream.input.recordings.multiview import POINTS_FILE, read_points, scaled_size
-from gsstream.input.recordings.watch_options import WatchOptions
+from gsstream.input.recordings.options import WatchOptions, options_of_query
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class WatchSource:
         folder, _, query = rest.partition("?")
         if not folder:
             raise SourceError("watch source: expected watch:DIR or watch:DIR?key=value&..., got no folder")
-        return cls(Path(folder), WatchOptions.from_query(query), scale=scale)
+        return cls(Path(folder), options_of_query(WatchOptions, query, "watch source"), scale=scale)
 
     @property
     def info(self) -> SourceInfo:

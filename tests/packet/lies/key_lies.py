@@ -13,7 +13,7 @@ from packet_scenes import make_key, make_meta
 
 from gsstream.packet import EncodedPacket, encode_key
 from gsstream.packet.base import MAX_GAUSSIANS, parse_packet
-from gsstream.packet.bulk import compress
+from gsstream.packet.bits import compress
 from gsstream.packet.key import most_gaussians
 from gsstream.packet.meta import hash_recipe, meta_to_json
 from gsstream.packet.symbols import encode_symbols

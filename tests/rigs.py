@@ -5,24 +5,32 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gsstream.core.cameras import Cameras
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 50.0
 
 
-def looking(centers: Sequence[Sequence[float]], targets: Sequence[Sequence[float]]) -> Cameras:
-    """Cameras held level (z is up) at these places, each looking at its target."""
+def looking(
+    centers: ArrayLike, targets: ArrayLike, up: Sequence[float] = (0.0, 0.0, 1.0), K: ArrayLike | None = None,
+    size: tuple[int, int] = (WIDTH, HEIGHT), near: float = 0.01, names: tuple[str, ...] | None = None,
+) -> Cameras:
+    """Cameras held level at these places, each looking at its target; one that looks along ``up`` has x to its right.
+
+    It shares nothing with how the library places cameras.
+    """
+    centers = np.asarray(centers, np.float64).reshape(-1, 3)
     viewmats = np.tile(np.eye(4), (len(centers), 1, 1))
-    for pose, center, target in zip(viewmats, np.array(centers, float), np.array(targets, float), strict=True):
+    for pose, center, target in zip(viewmats, centers, np.broadcast_to(targets, centers.shape), strict=True):
         forward = (target - center) / np.linalg.norm(target - center)
-        right = np.cross(forward, (0.0, 0.0, 1.0))
-        right /= np.linalg.norm(right)
+        right = np.cross(forward, up)
+        right = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-6 else np.array([1.0, 0, 0])
         pose[:3, :3] = [right, np.cross(forward, right), forward]
         pose[:3, 3] = -pose[:3, :3] @ center
-    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    names = tuple(f"cam{i}" for i in range(len(centers)))
-    return Cameras(names, viewmats, np.tile(K, (len(centers), 1, 1)), WIDTH, HEIGHT)
+    Ks = np.asarray([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]] if K is None else K, np.float64)
+    names = names or tuple(f"cam{i}" for i in range(len(centers)))
+    return Cameras(names, viewmats, np.tile(Ks, (len(centers), 1, 1)), *size, near)  # fmt: skip
 
 
 def on_arc(count: int, degrees: float, radius: float = 3.0, height: float = 0.6) -> list[list[float]]:

@@ -15,6 +15,7 @@ from gsstream.core.frame import PointCloud
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.world import IDENTITY, World, rig_similarity, snap_cameras
 from gsstream.player.software import render_numpy
+from tests.rigs import looking
 
 K = np.array([[60.0, 0, 24], [0, 60.0, 18], [0, 0, 1]])
 
@@ -34,15 +35,7 @@ def similarity(seed: int, scale: float = 1.0, shift: float = 0.0) -> World:
 
 
 def rig(eyes: np.ndarray, target=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0), names=None) -> Cameras:
-    poses = np.tile(np.eye(4), (len(eyes), 1, 1))
-    for pose, eye in zip(poses, np.asarray(eyes, np.float64), strict=True):
-        forward = (np.asarray(target) - eye) / np.linalg.norm(np.asarray(target) - eye)
-        right = np.cross(forward, up)
-        right /= np.linalg.norm(right)
-        pose[:3, :3] = right, np.cross(forward, right), forward
-        pose[:3, 3] = -pose[:3, :3] @ eye
-    names = names or tuple(f"cam{i}" for i in range(len(eyes)))
-    return Cameras(names, poses, np.tile(K, (len(eyes), 1, 1)), 48, 36, 0.01)
+    return looking(eyes, target, up, K, (48, 36), names=names)
 
 
 def ring(number: int) -> np.ndarray:

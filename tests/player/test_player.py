@@ -22,6 +22,7 @@ from gsstream.player.playback import Playback
 from gsstream.player.region import focus_point
 from gsstream.player.render import PlayerRenderer, SlowRendererWarning, find_renderer, render, to_bytes
 from gsstream.player.software import render_numpy
+from tests.rigs import looking
 
 NUMPY = PlayerRenderer("numpy", render_numpy)
 
@@ -39,20 +40,7 @@ def make_scene(seed=0, number=150, sh_rest=8, spread=0.6):
 
 
 def look_at(centers, target=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0), near=0.01):
-    """An independent rig builder: z up, cameras looking at a target."""
-    viewmats = []
-    for center in np.asarray(centers, float):
-        forward = np.asarray(target) - center
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, up)
-        right /= np.linalg.norm(right)
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-        viewmat[:3, 3] = -viewmat[:3, :3] @ center
-        viewmats.append(viewmat)
-    K = np.array([[60.0, 0, 33], [0, 62.0, 21], [0, 0, 1]])
-    ids = tuple(f"cam{i}" for i in range(len(viewmats)))
-    return Cameras(ids, np.array(viewmats), np.tile(K, (len(ids), 1, 1)), 71, 45, near)
+    return looking(centers, target, up, [[60.0, 0, 33], [0, 62.0, 21], [0, 0, 1]], (71, 45), near)
 
 
 ARC = [(3 * np.cos(a), 3 * np.sin(a), 1.0) for a in (-0.6, -0.2, 0.2, 0.6)]

@@ -18,23 +18,14 @@ from gsstream.packet.meta import meta_to_json
 from gsstream.player.paths import camera_path
 from gsstream.player.playback import Playback
 from gsstream.player.region import MIN_SWING, Region, recorded_region
+from tests.rigs import looking
 
 TURN = 2 * np.pi
 
 
-def rig_of(centers, targets, up=(0.0, 0.0, 1.0)) -> Cameras:
+def rig_of(centers, targets) -> Cameras:
     """Cameras at places [C, 3] that look at a target each."""
-    viewmats = []
-    for center, target in zip(np.asarray(centers, float), np.broadcast_to(targets, np.shape(centers)), strict=True):
-        forward = (target - center) / np.linalg.norm(target - center)
-        right = np.cross(forward, up)
-        right = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-6 else np.array([1.0, 0, 0])
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = right, np.cross(forward, right), forward
-        viewmat[:3, 3] = -viewmat[:3, :3] @ center
-        viewmats.append(viewmat)
-    Ks = np.tile([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]], (len(viewmats), 1, 1))
-    return Cameras(tuple(f"cam{i}" for i in range(len(viewmats))), np.array(viewmats), Ks, 64, 48)
+    return looking(centers, targets, K=[[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]], size=(64, 48))
 
 
 def ring(number: int, span: float = TURN, radius: float = 3.0, height: float = 1.0, start: float = 0.3) -> np.ndarray:

@@ -62,6 +62,10 @@ __all__ = [
 ]  # fmt: skip
 
 
+def __dir__() -> list[str]:
+    return __all__
+
+
 class Parts(TypedDict, total=False):
     """Parts by slot: a live one, or the name of one, which takes its settings from ``settings``."""
 

@@ -25,3 +25,7 @@ __all__ = [
     "Delta", "Playback", "PlayerState", "Scene", "StreamReader", "camera_path", "decode_packet", "export", "render",
     "to_bytes",
 ]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__

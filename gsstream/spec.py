@@ -29,6 +29,10 @@ __all__ = [
     "hookspec",
 ]  # fmt: skip
 
+
+def __dir__() -> list[str]:
+    return __all__
+
 ENTRY_POINT_GROUP = "gsstream"
 if TYPE_CHECKING:
     Kind = str

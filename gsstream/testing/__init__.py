@@ -18,3 +18,7 @@ __all__ = [
     "CheckResult", "SourceUnderTest", "World", "get_case", "images", "make_case", "parametrize_with_checks", "rig",
     "run_checks", "scene",
 ]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__

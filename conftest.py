@@ -36,7 +36,7 @@ LONG = (
     "web/test_page_joins", "flow/test_checks", "packet/test_fuzz", "flow/test_run_ends", "flow/test_watch",
     "flow/test_worlds", "input/prepare/test_validate", "lab/tests/test_tune", "queen/tests/test_queen_stream",
     "tools/test_soak", "flow/test_still_frames", "packet/test_corrupt", "input/seeds/test_depth_maps",
-    "input/recordings/test_layouts", "tools/test_cost_scripts",
+    "input/recordings/test_layouts",
     "flow/test_light_process", "player/test_player_memory", "evaluation/test_offline", "lab/tests/test_compare",
 )  # fmt: skip
 #: What ``make check`` runs: rooms whose tests are cheap, and the one test of whole runs that must never fail.

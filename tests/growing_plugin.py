@@ -11,6 +11,7 @@ from typing import final
 import numpy as np
 import pytest
 import torch
+from distribution import write_metadata
 from pydantic import Field
 
 from gsstream.api import FitContext, Growth, PartConfig, Rng, RowEdit, Scene, add_as_nodes, add_to_nodes
@@ -58,10 +59,7 @@ def gsstream_components() -> list[ComponentSpec]:
 @contextmanager
 def growth_installed(folder: Path) -> Iterator[None]:
     """In this process the part is installed as any plugin is: as the entry point of a distribution."""
-    info = folder / "growing_plugin-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: growing-plugin\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[gsstream]\ngrowing = growing_plugin\n")
+    write_metadata(folder, "growing-plugin", "1.0", "[gsstream]\ngrowing = growing_plugin\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(folder))
         yield

@@ -9,16 +9,14 @@ import tomllib
 from pathlib import Path
 
 import forked
+from distribution import write_metadata
 
 
 def install(project: Path, site: Path) -> None:
     """Make a project's ``src`` importable and its entry points known to processes that have ``site`` on their path."""
     data = tomllib.loads((project / "pyproject.toml").read_text())["project"]
-    info = site / f"{data['name'].replace('-', '_')}-{data['version']}.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {data['name']}\nVersion: {data['version']}\n")
     points = [f"{name} = {module}" for name, module in data["entry-points"]["gsstream"].items()]
-    (info / "entry_points.txt").write_text("\n".join(["[gsstream]", *points, ""]))
+    write_metadata(site, data["name"], data["version"], "\n".join(["[gsstream]", *points, ""]))
     with (site / "paths").open("a") as paths:
         paths.write(f"{project / 'src'}\n")
 

@@ -9,6 +9,7 @@ from typing import final
 
 import numpy as np
 import pytest
+from distribution import write_metadata
 from fresh import install, python
 
 from gsstream.api import FitContext, Growth, Rng, RowEdit, Scene
@@ -146,10 +147,7 @@ def test_a_broken_part_exits_with_1_and_numbers(
 ) -> None:
     (tmp_path / "gsstream_half_gate.py").write_text(BROKEN)
     (tmp_path / "gsstream_half_plugin.py").write_text(PLUGIN)
-    info = tmp_path / "gsstream_half-0.1.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: gsstream-half\nVersion: 0.1\n")
-    (info / "entry_points.txt").write_text("[gsstream]\nhalves = gsstream_half_plugin\n")
+    write_metadata(tmp_path, "gsstream-half", "0.1", "[gsstream]\nhalves = gsstream_half_plugin\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     for name in ("half", "gate/half", "halves", "gsstream-half"):
         assert run_command(["check", name, "--quiet"]) == 1

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from distribution import write_metadata
 from saboteurs import COMMAND_SABOTEURS, INSTALLED, METHOD_SABOTEURS, PACKET_SABOTEURS, SABOTEURS
 
 from gsstream.testing.kit import (
@@ -87,10 +88,7 @@ def test_a_plugin_whose_declaration_imports_torch_fails_exactly_that(
     from gsstream.testing.gate.example import ExampleGate
 
     (tmp_path / "gsstream_heavy_plugin.py").write_text(HEAVY)
-    info = tmp_path / "gsstream_heavy-0.1.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: gsstream-heavy\nVersion: 0.1\n")
-    (info / "entry_points.txt").write_text("[gsstream]\nheavy = gsstream_heavy_plugin\n")
+    write_metadata(tmp_path, "gsstream-heavy", "0.1", "[gsstream]\nheavy = gsstream_heavy_plugin\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     try:
         found = failed(run_checks(ExampleGate()))

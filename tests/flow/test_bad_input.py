@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from distribution import write_metadata
 from flow_runs import WORLD, arguments, demo_copy, encode, finish, metrics
 
 from gsstream.cli.main import run_command
@@ -120,10 +121,8 @@ def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, s
 
     def install(name: str, text: str) -> None:
         folder = tmp_path / "site"
-        (info := folder / f"gsstream_{name}-0.7.dist-info").mkdir(parents=True)
+        write_metadata(folder, f"gsstream-{name}", "0.7", f"[gsstream]\n{name} = gsstream_{name}\n")
         (folder / f"gsstream_{name}.py").write_text(text)
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: gsstream-{name}\nVersion: 0.7\n")
-        (info / "entry_points.txt").write_text(f"[gsstream]\n{name} = gsstream_{name}\n")
         monkeypatch.syspath_prepend(str(folder))
 
     return install

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import forked
 import pytest
+from distribution import write_metadata
 
 BROKEN = Path(__file__).parent / "broken"
 
@@ -28,11 +29,8 @@ class PluginLab:
         """Install a module given as text."""
         module = f"gsstream_{name}_plugin"
         (self.folder / f"{module}.py").write_text(source)
-        info = self.folder / f"gsstream_{name}-{version}.dist-info"
-        info.mkdir()
         distribution = f"gsstream-{name.replace('_', '-')}"
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n")
-        (info / "entry_points.txt").write_text(entry_points or f"[gsstream]\n{name} = {module}\n")
+        write_metadata(self.folder, distribution, version, entry_points or f"[gsstream]\n{name} = {module}\n")
 
     def python(self, code: str, *args: str, load: str | None = None, **env: str) -> subprocess.CompletedProcess[str]:
         """Run code in a fresh process; ``load`` limits the plugins so that others on this machine play no part."""

@@ -1,4 +1,4 @@
-"""DataOptions: the section ``data`` of a recipe, and disturbances. Imports nothing heavy, because recipes do not."""
+"""What a recipe (section ``data``) and a URI may say of a recording. Imports nothing heavy, because recipes do not."""
 
 from __future__ import annotations
 

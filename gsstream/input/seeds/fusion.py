@@ -61,7 +61,7 @@ def interpolate_depths(depths: FloatArray, known: BoolArray, iterations: int = 3
     """
     wanted = known | ~known.any(axis=(1, 2), keepdims=True)
     inverse = 1 / depths
-    filled: FloatArray = _push_pull(np.where(wanted, inverse, 0), wanted.astype(inverse.dtype))
+    filled: FloatArray = _fill_coarse_to_fine(np.where(wanted, inverse, 0), wanted.astype(inverse.dtype))
     for _ in range(iterations):
         padded = np.pad(filled, ((0, 0), (1, 1), (1, 1)), mode="edge")
         mean = padded[:, :-2, 1:-1] + padded[:, 2:, 1:-1] + padded[:, 1:-1, :-2] + padded[:, 1:-1, 2:]
@@ -70,13 +70,13 @@ def interpolate_depths(depths: FloatArray, known: BoolArray, iterations: int = 3
     return interpolated
 
 
-def _push_pull(values: FloatArray, weights: FloatArray) -> FloatArray:
+def _fill_coarse_to_fine(values: FloatArray, weights: FloatArray) -> FloatArray:
     """Means over ever larger blocks where nothing is known: a start from which relaxation converges quickly."""
     height, width = values.shape[1:]
     known = np.divide(values, weights, out=np.zeros_like(values), where=weights > 0)
     if height == 1 and width == 1:
         return known
-    coarse = _push_pull(_halve(values), _halve(weights))
+    coarse = _fill_coarse_to_fine(_halve(values), _halve(weights))
     spread = coarse.repeat(2, axis=1).repeat(2, axis=2)[:, :height, :width]
     return np.where(weights > 0, known, spread)
 

@@ -61,9 +61,10 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) 
         rows, logits = select(parts, view, view.hierarchy, scope)
     with log.phase("optimise"):
         generator, views = rng.stream("frame", frame.index), len(frame.cameras)
+        target = (view.everywhere() if scope is Scope.ALL else view).residual_target
         problem = Problem(
             scene.layout, view.hierarchy, rows, view.gaussians.rows(rows), logits, state.decoders,
-            view.session_for(rows), view.view_target, views, frame.cameras.width * frame.cameras.height, generator,
+            view.session_for(rows), target, views, frame.cameras.width * frame.cameras.height, generator,
             1.0 if tools.budget is None else tools.budget.step_scale,
         )  # fmt: skip
         schedule = scheduled(stream, frame, tools.budget)

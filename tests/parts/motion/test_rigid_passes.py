@@ -107,6 +107,20 @@ def test_motions_look_everywhere_unless_told_to_look_near_the_change(
     assert set(asked) == {tiles}
 
 
+@pytest.mark.parametrize(("large", "changed_alone"), [(960, False), (1, True)])
+def test_residuals_of_large_pictures_are_compared_where_something_changed(
+    large: int, changed_alone: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work = fit_fixture().work
+    monkeypatch.setattr("gsstream.core.picture_size.LARGE", large)
+    assert work._change is not None
+    weights = work.residual_target(0).tile_weights
+    assert (weights is not None) == changed_alone
+    if weights is not None:
+        assert torch.equal(weights > 0, work._change.dilated[0])
+    assert work.everywhere().residual_target(0).tile_weights is None, "a residual of every row is compared everywhere"
+
+
 def within(max_bytes: int | None) -> Moved:
     parts = method_with("motion", Coasting(Coasting.Config(votes=0, share=0, displaced=0, asked=0))).parts
     state = method_with("motion", Coasting()).chain()[1].state
@@ -137,9 +151,7 @@ def test_it_is_the_median_over_cameras_and_gaussians_of_distance_over_focal_leng
     Ks = np.tile(np.eye(3), (4, 1, 1))
     Ks[:, 0, 0] = Ks[:, 1, 1] = [50.0, 60.0, 70.0, 80.0]
     cameras = Cameras(tuple("abcd"), viewmats, Ks, 32, 24)
-    widths = [
-        np.linalg.norm(means - at, axis=1) / K[0, 0] for at, K in zip(cameras.centers, cameras.Ks, strict=True)
-    ]
+    widths = [np.linalg.norm(means - at, axis=1) / K[0, 0] for at, K in zip(cameras.centers, cameras.Ks, strict=True)]
     # To the bit: a step of motions is made of it, and a stream's bytes with it.
     assert pixel_size(means, cameras) == float(np.median(np.concatenate(widths)))
 

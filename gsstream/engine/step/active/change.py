@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,6 +10,8 @@ import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame
+from gsstream.core.picture_size import is_large
+from gsstream.core.processors import processors
 from gsstream.core.shapes import BoolArray, FloatArray, IntArray
 from gsstream.engine.step.active.blocks import BLOCK, changed_blocks
 from gsstream.parts.render.base import TILE
@@ -89,8 +92,15 @@ def detect_changed_tiles(previous: Frame, frame: Frame, threshold: float) -> Cha
     """
     if threshold == 0:
         return None
-    tiles = [_changed(previous.image(view), frame.image(view), threshold) for view in range(len(frame.cameras))]
-    return Change(torch.from_numpy(np.stack(tiles)), frame.cameras.height, frame.cameras.width)
+
+    def of(view: int) -> BoolArray:
+        return _changed(previous.image(view), frame.image(view), threshold)
+
+    cameras = frame.cameras
+    # Two views at a time need the memory of two, and in small pictures threads take longer than they save.
+    with ThreadPoolExecutor(processors() if is_large(cameras.width) else 1) as pool:
+        tiles = list(pool.map(of, range(len(cameras))))
+    return Change(torch.from_numpy(np.stack(tiles)), cameras.height, cameras.width)
 
 
 def _changed(before: FloatArray, after: FloatArray, threshold: float) -> BoolArray:

@@ -63,15 +63,11 @@ class FirstFrame(Section):
         description="standard deviation of noise on every centre, drawn anew in every iteration, fraction of the rig's "
         "extent (HiCoM): Gaussians that few cameras see fit them less closely",
     )  # fmt: skip
-    dropout: Literal["auto"] | Annotated[float, Field(ge=0, le=0.9)] = Field(
-        default="auto",
-        description="share of the Gaussians that is left out, drawn anew in every iteration: few cameras cannot tell a "
-        "surface from a cloud that is right from one of them. auto: 0.2 with at most 8 training cameras, else 0",
-    )
-    depth_smoothness: Literal["auto"] | Annotated[float, Field(ge=0, le=100)] = Field(
-        default="auto",
-        description="weight in the loss of the change of inverse depth where the training image has no edge; auto: 1 "
-        "with 6 to 8 training cameras that look inwards from around and with up to 5 that do not, else 0",
+    few_cameras: bool = Field(
+        default=True,
+        description="help few cameras, which cannot tell a surface from a cloud that is right from one of them: with "
+        "at most 8, leave a fifth of the Gaussians out of every iteration; with 6 to 8 around a room and up to 5 "
+        "elsewhere, keep inverse depth smooth where the training image has no edge",
     )
     lr_factor: float = Field(
         default=2.0, gt=0, le=100,
@@ -108,12 +104,9 @@ class Stream(Section):
     change_threshold: float = Field(
         default=0.0, ge=0, le=100,
         description="tiles whose pixels differ from the last frame by more than this many sigmas of their own spread "
-        "count as changed, and only Gaussians visible in them take part; 0: everything takes part",
+        "count as changed; only Gaussians visible in them take part, and only until their gate has closed. 0: "
+        "everything takes part to the end",
     )  # fmt: skip
-    freeze_closed: bool = Field(
-        default=False,
-        description="after each pass over the cameras, rows whose gate has closed leave the optimisation",
-    )
     rd_lambda: float = Field(
         default=0.0, ge=0, le=1,
         description="weight in the loss of the residual's estimated bits per pixel of one view; 0: none",

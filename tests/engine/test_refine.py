@@ -33,7 +33,7 @@ from gsstream.parts.render.activations import rotation_matrices
 WORLD = "synthetic:frames=6&views=4&width=48&height=32&supersample=1&static=1"
 SETTINGS: Mapping[str, Any] = {
     "first_frame.max_iterations": 10, "first_frame.points": "recording", "first_frame.max_points": 250,
-    "background": [0, 0, 0], "first_frame.shell": False, "first_frame.dropout": 0, "first_frame.depth_smoothness": 0,
+    "background": [0, 0, 0], "first_frame.shell": False, "first_frame.few_cameras": False,
     "stream.epochs": 1, "motion": "still",
     "stream.refine_frames": 3, "stream.refine_iterations": 20,
 }  # fmt: skip

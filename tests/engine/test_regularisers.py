@@ -12,7 +12,7 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import SH0, Gaussians
-from gsstream.engine.frame0.regularisers import DROPOUT, MOST_OPAQUE, Dropout, choose_regularisers
+from gsstream.engine.frame0.regularisers import DROPOUT, MOST_OPAQUE, Dropout, Regularisers, choose_regularisers
 from gsstream.engine.frame0.smooth_depth import PLACED, SmoothDepth
 from gsstream.parts.render.reference import ReferenceRenderer
 from gsstream.parts.render.wrt import NEVER_DRAWN, WrtScene
@@ -60,12 +60,12 @@ def test_the_cameras_decide_unless_the_recipe_does(views: int, dropout: float, i
     for cameras, smoothness in ((rig(views), in_line), (ring(views), in_a_ring)):
         chosen = choose_regularisers(FirstFrame(), cameras)
         assert (chosen.dropout, chosen.depth_smoothness) == (dropout, smoothness)
-    own = choose_regularisers(FirstFrame(dropout=0.0, depth_smoothness=3.0), rig(views))
-    assert (own.dropout, own.depth_smoothness) == (0, 3)
+    own = choose_regularisers(FirstFrame(few_cameras=False), rig(views))
+    assert (own.dropout, own.depth_smoothness) == (0, 0)
 
 
 def test_smoothness_takes_part_in_every_other_iteration_and_weighs_the_same() -> None:
-    chosen = choose_regularisers(FirstFrame(depth_smoothness=3.0), rig(6))
+    chosen = Regularisers(0.0, 3.0)
     weights = [chosen.smoothness_at(iteration, 100) for iteration in range(1, 101)]
     assert weights[:9] == [0] * 9
     assert set(weights[9:]) == {0, 6}

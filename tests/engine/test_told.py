@@ -130,8 +130,8 @@ def test_the_line_names_what_was_done_and_why() -> None:
     many = line(inwards(12, 360))
     assert "dropout" not in many
     assert "smoothness" not in many
-    own = line(inwards(6, 360), dropout=0.1, depth_smoothness=0, shell=False)
-    assert "dropout 0.1, as the recipe says" in own
+    own = line(inwards(6, 360), few_cameras=False, shell=False)
+    assert "dropout" not in own
     assert "smoothness" not in own
     assert "large seeds" not in own
 

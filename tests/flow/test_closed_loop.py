@@ -151,7 +151,7 @@ def test_training_and_transmission_apply_the_same_map(tmp_path: Path, monkeypatc
     original = step_module.quantise_residual
     monkeypatch.setattr(step_module, "quantise_residual", harden)
     witness = Witness(monkeypatch)
-    keep = {"motion": "still", "codec__trim": 0, "stream__freeze_closed": "false"}
+    keep = {"motion": "still", "codec__trim": 0, "stream__change_threshold": 0}
     encode(tmp_path, "--frames", "4", method="s2gs-edge", **keep)
     assert len(seen) == 3
     for frame, (problem, residual, rows) in enumerate(seen, 1):

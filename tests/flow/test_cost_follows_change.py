@@ -85,7 +85,7 @@ def test_rows_behind_closed_gates_leave_and_stay_as_they_were(
 
     monkeypatch.setattr(CpuSession, "narrow", counted)
     witness = Witness(monkeypatch)
-    settings = {"motion": "still", "stream__freeze_closed": "true", "stream__epochs": 4}
+    settings = {"motion": "still", "stream__epochs": 4}
     encode(tmp_path / "o", source=world, method="s2gs-edge", **settings)
     assert len(sizes) > 3, "some frame let rows go"
     lines = metrics(tmp_path / "o")

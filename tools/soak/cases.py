@@ -84,13 +84,12 @@ SOMETIMES: Mapping[str, Draw] = MappingProxyType({
     "first_frame.lr_means": _of(0.0, 1e-2),
     "first_frame.exposure": _of(True), "stream.active_threshold": _of(0.0, 0.05, 0.5, 0.99, 1.0),
     "stream.change_threshold": _of(0.0, 1.0, 6.0, 20.0, 100.0),
-    "stream.freeze_closed": _of(False, True),
     "stream.rd_lambda": _of(0.0, 1e-5, 3e-4, 1e-2, 1.0), "stream.on_error": _of("raise", "repeat"),
     "stream.progressive": _of(False, True),
     "stream.lr_final_factor": _of(1.0, 0.1, 1e-6),
     "loss.backend": _of("auto", "reference"),
     "codec.key_interval": _of(0, 1, 2, 3),
-    "data.leak": _of("none", "points", "training"), "data.images": _of("float32", "uint8"),
+    "data.leak": _of("none", "points", "training"),
 })  # fmt: skip
 #: Drawn with the others where the method is made of parts.
 OF_PARTS: Mapping[str, Draw] = MappingProxyType({

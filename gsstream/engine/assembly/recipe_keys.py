@@ -17,7 +17,7 @@ SESSION_KEYS = ("codec.key_rd_lambda", "codec.first_layer", "budget.memory", "st
 #: What only the optimisation of a residual reads: slots, and settings.
 RESIDUAL_KEYS = (
     "confidence", "propagation", "gate", "regularizer", "stream.epochs", "stream.lr_final_factor",
-    "stream.active_threshold", "stream.freeze_closed", "stream.rd_lambda", "stream.progressive",
+    "stream.active_threshold", "stream.rd_lambda", "stream.progressive",
 )  # fmt: skip
 
 

@@ -73,8 +73,7 @@ def _with_cache(parts: Assembly, megabytes: float) -> Assembly:
 
 def _fixed(info: SourceInfo, recipe: Recipe) -> int:
     # Images that are read at their own size are taken for 8-bit ones, as nearly all are.
-    bytes_wait = recipe.data.images == "uint8" or (recipe.data.images == "auto" and recipe.scale == 1)
-    waiting = WAITING / 4 if bytes_wait else WAITING + 1  # one frame is read before it is stored
+    waiting = WAITING / 4 if recipe.scale == 1 else WAITING + 1  # one frame is read before it is stored
     statistics = 1 if is_large(info.train.width) else 2
     images = (waiting + statistics) * len(info.train) + 4 * len(info.test) + WORKING
     return PROCESS + round(images * 12 * info.train.width * info.train.height)

@@ -27,7 +27,7 @@ class FrameImages:
         if self.device.type == "cpu":
             return torch.from_numpy(unpacked(self._images[view]))
         if view not in self._there:
-            stored = torch.from_numpy(packed(self._images[view], "auto")).to(self.device)
+            stored = torch.from_numpy(packed(self._images[view])).to(self.device)
             # Divided by a tensor, as the processor divides: a product with 1 / 255 would be another number.
             full = stored.new_full((), 255, dtype=torch.float32)
             self._there[view] = stored if stored.is_floating_point() else stored.float() / full

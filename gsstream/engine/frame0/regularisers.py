@@ -43,14 +43,11 @@ class Regularisers:
 
 
 def choose_regularisers(settings: FirstFrame, cameras: Cameras) -> Regularisers:
-    """Return what the recipe asks for, or what suits so many training cameras."""
-    dropout, smoothness = settings.dropout, settings.depth_smoothness
-    if dropout == "auto":
-        dropout = DROPOUT if len(cameras) <= FEW else 0.0
-    if smoothness == "auto":
-        pays = len(cameras) <= FEW and (len(cameras) >= SMOOTHNESS_CAMERAS) == stands_around(cameras)
-        smoothness = SMOOTHNESS if pays else 0.0
-    return Regularisers(dropout, smoothness)
+    """Return what suits so many training cameras; nothing where the recipe does not want it."""
+    if not settings.few_cameras or len(cameras) > FEW:
+        return Regularisers(0.0, 0.0)
+    pays = (len(cameras) >= SMOOTHNESS_CAMERAS) == stands_around(cameras)
+    return Regularisers(DROPOUT, SMOOTHNESS if pays else 0.0)
 
 
 class Dropout:

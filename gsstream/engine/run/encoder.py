@@ -154,7 +154,7 @@ class Encoder:
         self.parts.where.enter(end.player.frame)
         with one_torch_thread():
             shown = self.with_near_plane(image(end.shown))
-            shown = replace(shown, images=packed(shown.images, self.parts.recipe.data.images))
+            shown = replace(shown, images=packed(shown.images))
             self.state = self.method.resume(end.player, shown, tools)
         return end.player.frame
 

@@ -50,12 +50,10 @@ def first_frame_summary(parts: Assembly, cameras: Cameras, seeds: str) -> str:
     said = [f"seeds: {seeds}", f"background ({colour}), {why}"]
     if settings.shell:
         said.append(f"{SEEDS} large seeds behind the scene")
-    for name, asked, value, what in (
-        ("dropout", settings.dropout, chosen.dropout, f"{number} cameras cannot tell a surface from a cloud"),
-        ("smoothness of depth", settings.depth_smoothness, chosen.depth_smoothness, _why_smooth(cameras)),
-    ):
-        if value:
-            said.append(f"{name} {value:g}, {f'because {what}' if asked == 'auto' else 'as the recipe says'}")
+    if chosen.dropout:
+        said.append(f"dropout {chosen.dropout:g}, because {number} cameras cannot tell a surface from a cloud")
+    if chosen.depth_smoothness:
+        said.append(f"smoothness of depth {chosen.depth_smoothness:g}, because {_why_smooth(cameras)}")
     return f"frame 0 was made with {'; '.join(said)}"
 
 

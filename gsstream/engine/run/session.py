@@ -85,7 +85,7 @@ def run(
         # This is also the way when resuming finds no complete frame 0: the incomplete one is cut off and made again.
         StreamWriter.open(out / STREAM, resume=resume, last_frame=done - 1 if done else None) as state.writer,
         state.progress,
-        Prefetcher(source, indices, storage=parts.recipe.data.images) as frames,
+        Prefetcher(source, indices, pack=True) as frames,
     ):
         for train, test, waited in _timed(frames, source):
             listener.before()

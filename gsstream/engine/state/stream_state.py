@@ -66,8 +66,8 @@ class StreamState:
 
     player: PlayerState  # exactly what every player has after the last packet (decoded from its bytes)
     hierarchy: Hierarchy  # groups of the layout in ``player``
-    #: Training images of the last frame whose packet changed the scene: what the scene shows. Stored as the recipe
-    #: says (``data.images``).
+    #: Training images of the last frame whose packet changed the scene: what the scene shows. As bytes
+    #: where bytes hold them.
     previous: Frame
     #: Linear decoders to continue from; equal to the player's once they were sent.
     decoders: Mapping[str, torch.Tensor] = field(default_factory=dict)

@@ -80,7 +80,7 @@ def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) 
         # A frame that changed nothing is not what the scene shows: the next one is compared with the last that did, so
         # that a change too slow to see from frame to frame adds up until it is seen.
         unchanged = fitted.delta.is_empty
-        shown = state.previous if unchanged else replace(frame, images=packed(frame.images, parts.recipe.data.images))
+        shown = state.previous if unchanged else replace(frame, images=packed(frame.images))
         session, resident = keep(view, scene, fitted.delta, player)
         kept = replace(state, previous=shown, session=session, resident=resident)
         after = next_state(parts.motion, kept, player, rng)

@@ -37,7 +37,7 @@ MAX_RETAINED_SHARE = 0.9
 def optimise(parts: Assembly, problem: Problem, schedule: Schedule) -> Solution:
     """Minimise photometric loss + penalty + rate over the epochs of the schedule, one view per iteration.
 
-    After every epoch rows whose gate has closed may leave, as the recipe says.
+    After every epoch rows whose gate has closed leave, but where the recipe lets everything take part.
     """
     if len(problem.rows) == 0:
         return Solution(problem.rows.cpu(), {}, {}, problem.logits.cpu())
@@ -54,7 +54,7 @@ def optimise(parts: Assembly, problem: Problem, schedule: Schedule) -> Solution:
         done += 1
         schedule.end_epoch(done)
         fit.open_gates.append(int(fit.opened().sum()))
-        if parts.recipe.stream.freeze_closed and done < schedule.epochs:
+        if parts.recipe.stream.change_threshold > 0 and done < schedule.epochs:
             fit.release(done / schedule.epochs)
             if len(fit.rows) == 0:
                 break

@@ -9,7 +9,6 @@ from urllib.parse import parse_qsl
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from gsstream.core.errors import SourceError, suggest
-from gsstream.core.storage import Storage
 
 Options = TypeVar("Options", bound=BaseModel)
 
@@ -55,7 +54,7 @@ UNDISTURBED = Disturbances()
 
 
 class DataOptions(BaseModel):
-    """Section ``data`` of a recipe: the split, what is done about bad images, and how images wait in memory."""
+    """Section ``data`` of a recipe: the split, and what is done about bad images."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
@@ -82,12 +81,6 @@ class DataOptions(BaseModel):
         default="stop",
         description="an image after frame 0 that cannot be read: stop: the run ends with its name; repeat: the "
         "camera's last image stands in; drop: the whole frame becomes an empty packet",
-    )
-    images: Storage = Field(
-        default="auto",
-        description="how training images wait in memory (decoded ahead, and those of the last frame). auto: as bytes "
-        "where that is exact, as for 8 bits read at scale 1, else float32; uint8 rounds values by at "
-        "most 1/510",
     )
 
     @property

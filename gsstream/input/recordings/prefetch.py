@@ -13,7 +13,7 @@ import numpy as np
 
 from gsstream.core.errors import EndOfRecording, GsstreamError, InputError, SourceError
 from gsstream.core.frame import Frame
-from gsstream.core.storage import Storage, packed
+from gsstream.core.storage import packed
 from gsstream.input.recordings.base import FrameSource, LiveSource, SingleImages
 from gsstream.input.recordings.canonical import to_file_coordinates
 
@@ -27,18 +27,18 @@ class Prefetcher:
 
     An error while reading a frame is raised when its turn comes; iteration then ends, as it does where a growing
     recording does. Use as a context manager, or call ``close``, so that threads end. ``depth`` None: 2, and 1 where the
-    images of one pair take more than ``LARGE_PAIR``.
+    images of one pair take more than ``LARGE_PAIR``. ``pack``: training images wait as bytes where bytes hold them.
     """
 
     def __init__(
         self, source: FrameSource, indices: Iterable[int], *, depth: int | None = None, workers: int = 1,
-        storage: Storage = "float32",
+        pack: bool = False,
     ) -> None:  # fmt: skip
         if depth is None:
             depth = 1 if _pair_bytes(source) > LARGE_PAIR else 2
         if depth < 1 or workers < 1:
             raise InputError(f"prefetcher: depth and workers must be at least 1, got depth {depth}, workers {workers}")
-        self._source, self._storage = source, storage
+        self._source, self._pack = source, pack
         self._todo = iter(indices)
         self._pending: deque[Future[FramePair]] = deque()
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="gsstream-prefetch")
@@ -84,7 +84,7 @@ class Prefetcher:
     def _submit(self) -> None:
         # Taking one index at a time keeps the bound even for an endless stream of indices.
         for index in self._todo:
-            self._pending.append(self._pool.submit(_read_pair, self._source, index, self._storage))
+            self._pending.append(self._pool.submit(_read_pair, self._source, index, self._pack))
             break
 
 
@@ -93,32 +93,33 @@ def _pair_bytes(source: FrameSource) -> int:
     return sum(12 * len(rig) * rig.width * rig.height for rig in (source.info.train, source.info.test))
 
 
-def _packed_views(source: FrameSource, index: int, storage: Storage) -> Any:
+def _packed_views(source: FrameSource, index: int) -> Any:
     """[C, H, W, 3] uint8: the training images read and packed one by one, so that no whole frame is float32 on the way.
 
     None where a source cannot read single images, or bytes do not hold them.
     """
     single, cameras = to_file_coordinates(source), source.info.train
-    if storage == "float32" or not isinstance(single, SingleImages) or isinstance(single, LiveSource):
+    if not isinstance(single, SingleImages) or isinstance(single, LiveSource):
         return None
     views = np.empty((len(cameras), cameras.height, cameras.width, 3), np.uint8)
     for out, name in zip(views, cameras.ids, strict=True):
-        view = packed(single.image(index, name), storage)
+        view = packed(single.image(index, name))
         if view.dtype != np.uint8 or view.shape != out.shape:
             return None
         out[...] = view
     return views
 
 
-def _read_pair(source: FrameSource, index: int, storage: Storage) -> FramePair:
+def _read_pair(source: FrameSource, index: int, pack: bool) -> FramePair:
     try:
-        views = _packed_views(source, index, storage)
+        views = _packed_views(source, index) if pack else None
         if views is not None:
             # All but the images is that of the test cameras' frame of the same instant.
             test = source.frame(index, "test")
             return replace(test, images=views, cameras=source.info.train), test
         train = source.frame(index, "train")
-        pair = replace(train, images=packed(train.images, storage)), source.frame(index, "test")
+        images = packed(train.images) if pack else train.images
+        pair = replace(train, images=images), source.frame(index, "test")
     except GsstreamError:
         raise
     except Exception as error:  # a source may be a plugin's: its failure is reported with its name

@@ -12,7 +12,6 @@ from gsstream.core.errors import EndOfRecording, SourceError
 from gsstream.core.frame import Arrival, Frame, PointCloud
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
-from gsstream.core.storage import rounded
 from gsstream.input.recordings.base import (
     AdaptiveSource,
     AttributedPoints,
@@ -110,8 +109,6 @@ class TransformedSource:
                 bad |= read != shown
             else:
                 images[row] = 0
-            if split == "train":
-                images[row] = rounded(images[row], self._options.images)
         if bad and split == "test":  # nothing is measured against an image of another time
             cameras, images = cameras.select([]), images[:0]
         if bad and split == "train" and self._options.bad_image == "drop":

@@ -143,7 +143,7 @@ def test_the_tables_stand_on_the_letter_of_the_paper(catalog: Catalog, rows: dic
     found = full(catalog).recipe
     assert recipe_hash(found) == recipe_hash(paper)
     assert found.gate.params["noise"] == "logistic"
-    assert not found.stream.freeze_closed
+    assert found.stream.change_threshold == 0
     views = 27
     assert found.first_frame.epochs * views <= found.first_frame.max_iterations
 

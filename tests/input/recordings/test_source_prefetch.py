@@ -140,7 +140,7 @@ class Singly:
 def test_bytes_are_read_camera_by_camera_and_other_images_whole(shift: float, dtype: type, wholes: int) -> None:
     """Either way the frame is the one that the source gives."""
     source, plain = Singly(shift), Singly(shift)
-    with Prefetcher(source, range(3), storage="auto") as frames:
+    with Prefetcher(source, range(3), pack=True) as frames:
         for index, (train, test) in enumerate(frames):
             want = plain.frame(index)
             assert train.images.dtype == dtype

@@ -14,7 +14,7 @@ from gsstream.core.changes.rows import gather_rows
 from gsstream.core.frame import Frame
 from gsstream.core.projection import inside, project
 from gsstream.core.shapes import FloatArray, IntArray
-from gsstream.core.storage import packed, unpacked
+from gsstream.core.storage import unpacked
 from gsstream.engine.run.displacement import screen_displacement
 from gsstream.input.recordings.base import FrameSource
 from gsstream.metrics.moving import changed_mask, dilate
@@ -65,7 +65,8 @@ class LeftBehind:
         """Keep track of rows while Gaussians are added and removed."""
         if key is not None:
             visible = player.gaussians.opacities.reshape(-1) > FAINT
-            self._images, self._places = packed(np.clip(key.images, 0, 1), "uint8"), player.gaussians.means
+            self._images = np.rint(255 * np.clip(key.images, 0, 1)).astype(np.uint8)
+            self._places = player.gaussians.means
             self._rows = np.where(visible, np.arange(len(visible)), -1)
             return
         delta = player.delta

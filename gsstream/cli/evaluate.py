@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -25,6 +26,7 @@ from gsstream.core.errors import InputError, PacketError
 
 if TYPE_CHECKING:
     from gsstream.evaluation.evaluate import Evaluation
+    from gsstream.input.recordings.base import SourceInfo
     from gsstream.metrics import OnnxLpips
 
 
@@ -67,6 +69,22 @@ class LpipsOptions:
     ] = None
 
 
+@dataclass(frozen=True)
+class Asked:
+    """What is measured: frames from the first to before the last, LPIPS, and the protocol that it has to fit."""
+
+    frames: tuple[int | None, int | None]
+    lpips: OnnxLpips | None
+    protocol: str | None
+
+    def fits(self, info: SourceInfo, leak: str) -> None:
+        """Raise InputError where the protocol does not admit this recording, or what its test cameras gave."""
+        from gsstream.evaluation.protocol import check_protocol
+
+        if self.protocol is not None:
+            check_protocol(self.protocol, info, leak)
+
+
 @grouped
 def evaluate(
     elsewhere: Elsewhere,
@@ -76,6 +94,13 @@ def evaluate(
         str | None, typer.Option("--source", help="Recording to compare with; default: the one it was made from.")
     ] = None,
     frames: Frames = None,
+    protocol: Annotated[
+        str | None,
+        typer.Option(
+            "--protocol", metavar="panoptic-sports|n3dv|meetroom",
+            help="Refuse what a published protocol does not admit, and add the numbers that it reports.",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Every view of every frame as JSON, for scripts.")] = False,
     max_memory: MaxMemory = None,
 ) -> None:
@@ -83,15 +108,25 @@ def evaluate(
 
     Also what a method left that was trained elsewhere: --ply-sequence or --renders with --source.
     """
+    from gsstream.evaluation.protocol import find_protocol, protocol_line, protocol_numbers
+
     _check(stream, source, elsewhere)
+    if protocol is not None:
+        find_protocol(protocol)
     lpips = _lpips(network.lpips_onnx, network.lpips_range)
-    chosen, damage, said = frame_range(frames), None, ""
+    asked, damage, said = Asked(frame_range(frames), lpips, protocol), None, ""
     if stream is not None:
-        evaluation, damage = _of_stream(stream, source, chosen, lpips, size_of(max_memory))
+        evaluation, damage = _of_stream(stream, source, asked, size_of(max_memory))
     else:
         assert source is not None, "checked above"
-        evaluation, said = _of_files(elsewhere, source, chosen, lpips)
-    typer.echo(evaluation.to_json() if as_json else "\n\n".join(filter(None, (evaluation.table(), said))))
+        evaluation, said = _of_files(elsewhere, source, asked)
+    numbers = None if protocol is None else protocol_numbers(protocol, evaluation)
+    if as_json:
+        found = json.loads(evaluation.to_json()) | ({} if numbers is None else {"protocol": numbers})
+        typer.echo(json.dumps(found, indent=1))
+    else:
+        lines = evaluation.table(), said, "" if numbers is None else protocol_line(numbers)
+        typer.echo("\n\n".join(filter(None, lines)))
     fail_with(damage)
 
 
@@ -114,7 +149,7 @@ def _lpips(file: Path | None, lower: str | None) -> OnnxLpips | None:
 
 
 def _of_stream(
-    stream: Path, source: str | None, chosen: tuple[int | None, int | None], lpips: OnnxLpips | None, most: int | None
+    stream: Path, source: str | None, asked: Asked, most: int | None
 ) -> tuple[Evaluation, PacketError | None]:
     from gsstream.engine.run.recording import reopen_recording
     from gsstream.evaluation.evaluate import evaluate as evaluate_stream
@@ -124,7 +159,7 @@ def _of_stream(
     file = stream_file(stream)
     with Playback(file, max_memory=most) as playback:
         meta = playback.meta
-        frames, damage = playback.sound(*chosen)
+        frames, damage = playback.sound(*asked.frames)
         if playback.limit is not None:
             playback.limit.check_pictures(meta.test.width, meta.test.height, len(meta.test))
             for frame in frames:
@@ -134,13 +169,14 @@ def _of_stream(
     check_recipe(file, meta.recipe)
     recording = reopen_recording(uri, meta.recipe, catalog)
     try:
-        return evaluate_stream(file, recording, frames=frames, lpips=lpips, progress=progress_on("frame")), damage
+        asked.fits(recording.info, meta.recipe["data"].get("leak", "none"))
+        return evaluate_stream(file, recording, frames=frames, lpips=asked.lpips, progress=progress_on("frame")), damage
     finally:
         recording.close()
 
 
 def _of_files(
-    other: Elsewhere, source: str, chosen: tuple[int | None, int | None], lpips: OnnxLpips | None
+    other: Elsewhere, source: str, asked: Asked
 ) -> tuple[Evaluation, str]:
     """The evaluation of a folder, and a line that says what its files take."""
     from gsstream.engine.run.recording import open_recording
@@ -154,6 +190,7 @@ def _of_files(
     found = resolve_recipe("hold", catalog.recipe_path, files, options.overrides(None, scale=other.scale)).recipe
     recording = open_recording(source, found, catalog)
     try:
+        asked.fits(recording.info, found.data.leak)
         if other.ply_sequence is not None:
             # What the files of others were trained on is black, unless they or a recipe say otherwise.
             behind = (0.0, 0.0, 0.0) if found.background == "auto" else found.background
@@ -161,9 +198,9 @@ def _of_files(
         else:
             assert other.renders is not None, "checked above"
             shown = Renders(other.renders, recording.info, other.first)
-        low, high = chosen
+        low, high = asked.frames
         frames = [t for t in shown.frames if t >= (low or 0) and (high is None or t < high)]
-        evaluation = evaluate_frames(shown, recording, frames=frames, lpips=lpips, progress=progress_on("frame"))
+        evaluation = evaluate_frames(shown, recording, frames=frames, lpips=asked.lpips, progress=progress_on("frame"))
     finally:
         recording.close()
     plys = [shown.file(t) for t in frames] if other.ply_sequence is not None else []

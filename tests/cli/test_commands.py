@@ -52,7 +52,7 @@ OPTIONS = {
     "gsstream info": ["STREAM", "--json"],
     "gsstream evaluate": [
         "STREAM", "--source", "--ply-sequence", "--renders", "--files", "--first", "--frames", "--recipe", "--scale",
-        "--lpips-onnx", "--lpips-range", "--json", "--max-memory",
+        "--lpips-onnx", "--lpips-range", "--protocol", "--json", "--max-memory",
     ],
     "gsstream methods": ["NAME", "--full"],
     "gsstream recipe": ["METHOD", "--recipe", "--set", "--full", "--schema"],

@@ -1,0 +1,98 @@
+"""Published protocols: what a recording has to be so that its numbers stand beside printed ones, and those numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+from gsstream.core.errors import InputError, UnknownName
+from gsstream.evaluation.evaluate import Evaluation
+from gsstream.evaluation.records import mean
+from gsstream.input.recordings.base import SourceInfo
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationProtocol:
+    """How a paper measures: size of the pictures, cameras, and number of frames from the first on."""
+
+    width: int  # pixels
+    height: int
+    test: tuple[str, ...]  # the test cameras, by id
+    train: int | None  # number of training cameras; None: all others, which differ from scene to scene
+    frames: int
+    source: str  # the paper
+    how: str  # what a recording of another size or other cameras needs
+
+
+PROTOCOLS: Mapping[str, EvaluationProtocol] = MappingProxyType({
+    "panoptic-sports": EvaluationProtocol(
+        640, 360, ("cam00", "cam10", "cam15", "cam30"), 27, 150, "Dynamic 3D Gaussians (Luiten et al. 2024)",
+        "run with --scale 1 and without data.train_views, data.train_cameras or data.test_cameras",
+    ),
+    "n3dv": EvaluationProtocol(
+        1352, 1014, ("cam00",), None, 300, "Neural 3D Video (Li et al. 2022), as 3DGStream and S2GS measure it",
+        "run with --recipe configs/recordings/n3dv.yaml",
+    ),
+    "meetroom": EvaluationProtocol(
+        1280, 720, ("cam_0",), 12, 300, "StreamRF (Li et al. 2022), as 3DGStream and S2GS measure it",
+        "run with --recipe configs/recordings/meetroom.yaml",
+    ),
+})  # fmt: skip
+
+
+def find_protocol(name: str) -> EvaluationProtocol:
+    """Return the protocol of this name. Raises UnknownName."""
+    if name not in PROTOCOLS:
+        raise UnknownName("protocol", name, list(PROTOCOLS))
+    return PROTOCOLS[name]
+
+
+def check_protocol(name: str, info: SourceInfo, leak: str) -> None:
+    """Refuse what is measured otherwise than the protocol says.
+
+    Arguments:
+        name: of the protocol.
+        info: the recording as it was used, after scale and split.
+        leak: ``data.leak`` of the run: what its test cameras gave to it.
+
+    Raises InputError, and UnknownName for another protocol.
+    """
+    wanted, rig = find_protocol(name), info.test
+    found = {
+        "pictures": (f"{wanted.width} x {wanted.height}", f"{rig.width} x {rig.height}"),
+        "test cameras": (", ".join(sorted(wanted.test)), ", ".join(sorted(rig.ids)) or "none"),
+        "training cameras": (wanted.train or len(info.train), len(info.train)),
+        "data.leak": ("none", leak),
+    }
+    for what, (expected, got) in found.items():
+        if expected != got:
+            raise InputError(f"--protocol {name}: {what}: expected {expected}, got {got}; {wanted.how}")
+
+
+def protocol_numbers(name: str, evaluation: Evaluation) -> dict[str, Any]:
+    """Return what the protocol reports: means over test cameras and frames, the first included.
+
+    Raises InputError where other frames were evaluated than those from the first one on, or more than the protocol has.
+    """
+    wanted, frames = find_protocol(name), sorted(evaluation.series("psnr"))
+    if frames != list(range(len(frames))) or len(frames) > wanted.frames:
+        got = f"{frames[0]} to {frames[-1]}" if frames else "none"
+        raise InputError(
+            f"--protocol {name}: frames: expected 0 to at most {wanted.frames - 1}, got {got}; "
+            f"say --frames 0:{wanted.frames}"
+        )
+    names = ("psnr", "ssim") if evaluation.lpips_variant is None else ("psnr", "ssim", "lpips")
+    means = {key: mean(getattr(view, key) for view in evaluation.views) for key in names}
+    return {"name": name, "frames": len(frames), "of_frames": wanted.frames, "source": wanted.source, **means}
+
+
+def protocol_line(numbers: Mapping[str, Any]) -> str:
+    """Return the same in a sentence."""
+    lpips = f", LPIPS {numbers['lpips']:.3f}" if "lpips" in numbers else ""
+    return (
+        f"protocol {numbers['name']} of {numbers['source']}: PSNR {numbers['psnr']:.2f} dB, SSIM {numbers['ssim']:.3f}"
+        f"{lpips}; means over test cameras and {numbers['frames']} frames of its {numbers['of_frames']}, the first "
+        "included, no colour of a test camera corrected"
+    )

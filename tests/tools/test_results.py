@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from gsstream.core.errors import InputError
-from tools.results import PAGES, TABLE, fill, filled, table_of
+from tools.results import PAGES, TABLE, fill, filled, read_rows, table_of
 
 RUN = {"scene": "a", "name": "edge", "seed": 0, "frames": 3, "psnr": 30.0, "kb": 2.0}
 
@@ -21,6 +21,19 @@ def test_tables_of_the_pages_are_made_from_their_data() -> None:
     known = {path.stem for path in (PAGES / "data").glob("*.jsonl")}
     used = {name.strip() for text in pages for found in TABLE.finditer(text) for name in found["files"].split(",")}
     assert known == used, "data that no page shows, or the other way round"
+
+
+def test_the_table_of_the_readme_is_that_of_the_published_protocol() -> None:
+    rows = {row["name"]: row for row in read_rows("protocol-peers", PAGES)}
+    text = (PAGES.parents[1] / "README.md").read_text(encoding="utf-8")
+    table = text.split("## Numbers", 1)[1].split("## ", 1)[0]
+    lines = [line.replace("*", "").split("|")[1:-1] for line in table.splitlines() if line.startswith("| ")][1:]
+    assert len(lines) >= 5
+    for name, *numbers in lines:
+        row = rows[name.split("`")[1]]
+        found = [row["psnr"], row["psnr_changed"], row["kb"], row["cpu_seconds"]]
+        expected = [f"{value:{form}}" for value, form in zip(found, (".2f", ".2f", ".1f", ".1f"), strict=True)]
+        assert [number.strip() for number in numbers] == expected, name
 
 
 def test_seeds_are_one_line_and_what_was_not_measured_is_a_dash() -> None:

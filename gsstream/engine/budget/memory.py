@@ -35,7 +35,7 @@ def min_memory(info: SourceInfo, recipe: Recipe) -> int:
 
 
 def limit_memory(parts: Assembly, info: SourceInfo) -> Assembly:
-    """Return the parts with limits on Gaussians and on the renderer's cache that the budget of memory can hold.
+    """Return the parts with so few Gaussians and so small a cache of the renderer that the memory budget holds.
 
     Raises InputError when the budget is below what any run of this recording needs.
     """

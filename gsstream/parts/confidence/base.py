@@ -20,7 +20,7 @@ class ConfidenceTraits(Traits):
         needs_renderer: reads screen gradients from the context.
         floor: largest logit of a Gaussian that no camera sees, or of a static scene.
         finds_motion: ranks what moved above what did not.
-        monotone_in_change: a stronger change never makes what changed less suspect.
+        monotone_in_change: a stronger change never lowers the confidence of what changed.
         brightness: largest mean logit of a still scene that becomes brighter by a fiftieth of full scale; None: no
             promise.
     """

@@ -17,11 +17,11 @@ class PropagationTraits(Traits):
     """What a propagation claims.
 
     Arguments:
-        conservative: no node is less suspect than its most suspect Gaussian.
+        conservative: no node's confidence is below that of any of its Gaussians.
         idempotent: applying it twice equals applying it once.
         differentiable: gradients flow from nodes to Gaussians.
         normalised: keeps the scale: constants stay constant, the flat structure changes nothing.
-        parent_bound: no node is less suspect than its children.
+        parent_bound: no node's confidence is below that of its children.
     """
 
     conservative: bool = False

@@ -1,4 +1,4 @@
-"""Group maximum: a node is as suspect as its most suspect Gaussian."""
+"""Group maximum: a node has the highest confidence of its Gaussians."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ class ExampleConfidence(ConfidenceEstimator):
     traits = ConfidenceTraits(needs_renderer=True, finds_motion=True, monotone_in_change=True)
 
     def claims(self) -> ConfidenceTraits:
-        # A share of the largest gradient: an even change of light makes a few Gaussians suspect, never half of them.
+        # A share of the largest gradient: an even change of light marks a few Gaussians, never half of them.
         return replace(self.traits, floor=self.config.floor, brightness=0.0)
 
     def estimate(self, context: FrameContext) -> torch.Tensor:

@@ -81,7 +81,7 @@ def check_propagation_monotone(part: Propagation) -> None:
 
 @check("propagation", trait="conservative")
 def check_propagation_conservative(part: Propagation) -> None:
-    """No suspect is lost: a node is at least as suspect as each of its members."""
+    """Nothing that changed is lost: a node's confidence is at least that of each of its members."""
     for name in WORLDS:
         case = get_case(name)
         held = _spread(part, case)[case.hierarchy.node_of]
@@ -112,7 +112,7 @@ def check_propagation_idempotent(part: Propagation) -> None:
 
 @check("propagation", trait="parent_bound")
 def check_propagation_parent_bound(part: Propagation) -> None:
-    """A parent is at least as suspect as each of its children."""
+    """A parent's confidence is at least that of each of its children."""
     case = get_case("cloud")
     got = _spread(part, case)
     at_most("children against their parents", got, got[case.hierarchy.parent], 1e-5, ROUNDING)

@@ -1,4 +1,4 @@
-"""Tree maximum: a tree is as suspect as its most suspect Gaussian."""
+"""Tree maximum: a tree has the highest confidence of its Gaussians."""
 
 from __future__ import annotations
 

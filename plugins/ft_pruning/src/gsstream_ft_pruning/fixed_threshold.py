@@ -1,4 +1,4 @@
-"""Fixed-threshold pruning: what is not suspect enough does not count at all."""
+"""Fixed-threshold pruning: confidence below a threshold does not count at all."""
 
 from __future__ import annotations
 

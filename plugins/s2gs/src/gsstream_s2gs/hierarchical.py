@@ -1,4 +1,4 @@
-"""Hierarchical feature propagation: a tree is as suspect as its most suspect Gaussian."""
+"""Hierarchical feature propagation: a tree has the highest confidence of its Gaussians."""
 
 from __future__ import annotations
 

@@ -166,6 +166,18 @@ def test_a_line_without_room_leaves_no_half(tmp_path) -> None:
     assert path.read_bytes().endswith(b"\n")
 
 
+def test_what_a_shell_started_in_the_background_is_ended_by_sigterm_too() -> None:
+    """There SIGINT is ignored, so passing SIGTERM on as SIGINT would end nothing."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with pytest.raises(KeyboardInterrupt), ended_by_signals() as came:
+            signal.raise_signal(signal.SIGTERM)
+        assert came == [signal.SIGTERM]
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_signals_of_services_arrive_as_an_interrupt(name) -> None:
     number = getattr(signal, name)

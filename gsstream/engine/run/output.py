@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from gsstream.core.errors import OutputError
@@ -136,7 +137,7 @@ def disk_errors(out: Path) -> Iterator[None]:
 def ended_by_signals(names: tuple[str, ...] = ("SIGTERM", "SIGHUP")) -> Iterator[list[int]]:
     """Let services end a run as Ctrl-C does: after the frame in flight, with a valid stream.
 
-    Each of the signals is passed on as SIGINT, whose handler decides. Gives the list of signals that came; the exit
+    The handler of SIGINT is called for each of the signals, and decides. Gives the list of signals that came; the exit
     code that services expect is 128 plus the first. Does nothing outside of the main thread, where no handler can be
     set, and leaves a signal alone that the process was told to ignore (nohup).
     """
@@ -145,9 +146,12 @@ def ended_by_signals(names: tuple[str, ...] = ("SIGTERM", "SIGHUP")) -> Iterator
         yield came
         return
 
-    def passed_on(number: int, _frame: object) -> None:
+    def passed_on(number: int, frame: FrameType | None) -> None:
         came.append(number)
-        signal.raise_signal(signal.SIGINT)
+        handler = signal.getsignal(signal.SIGINT)
+        if not callable(handler):  # ignored, as in what a shell starts in the background
+            raise KeyboardInterrupt
+        handler(signal.SIGINT, frame)
 
     before: dict[int, Any] = {}
     for name in names:

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from gsstream_lab.report.groups import read_sweep_data
-from gsstream_lab.report.quantities import BY_KEY, cell
+from gsstream_lab.report.quantities import BY_KEY, cell, spread
 
 from gsstream.core.errors import InputError
 from gsstream.evaluation.summary import format_table
@@ -71,9 +71,7 @@ def table_of(rows: Sequence[Row], keys: Sequence[str]) -> str:
         cells = []
         for key in keys:
             values = [run.get(key, math.nan) for run in runs]
-            known = len(values) > 1 and all(map(math.isfinite, values))
-            spread = statistics.stdev(values) if known else math.nan
-            cells.append(cell(key, statistics.fmean(values), spread))
+            cells.append(cell(key, statistics.fmean(values), spread(values)))
         table.append([f"`{name}`", *([scene] if scenes else []), str(frames), str(len(runs)), *cells])
     return format_table(table)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -77,12 +77,12 @@ class Asked:
     lpips: OnnxLpips | None
     protocol: str | None
 
-    def fits(self, info: SourceInfo, leak: str) -> None:
-        """Raise InputError where the protocol does not admit this recording, or what its test cameras gave."""
+    def fits(self, info: SourceInfo, leak: str, frames: Sequence[int]) -> None:
+        """Raise InputError where the protocol does not admit this recording, what its test cameras gave, or frames."""
         from gsstream.evaluation.protocol import check_protocol
 
         if self.protocol is not None:
-            check_protocol(self.protocol, info, leak)
+            check_protocol(self.protocol, info, leak, frames)
 
 
 @grouped
@@ -122,8 +122,7 @@ def evaluate(
         evaluation, said = _of_files(elsewhere, source, asked)
     numbers = None if protocol is None else protocol_numbers(protocol, evaluation)
     if as_json:
-        found = json.loads(evaluation.to_json()) | ({} if numbers is None else {"protocol": numbers})
-        typer.echo(json.dumps(found, indent=1))
+        typer.echo(evaluation.to_json(numbers))
     else:
         lines = evaluation.table(), said, "" if numbers is None else protocol_line(numbers)
         typer.echo("\n\n".join(filter(None, lines)))
@@ -169,7 +168,8 @@ def _of_stream(
     check_recipe(file, meta.recipe)
     recording = reopen_recording(uri, meta.recipe, catalog)
     try:
-        asked.fits(recording.info, meta.recipe["data"].get("leak", "none"))
+        # Another writer may leave the recipe empty.
+        asked.fits(recording.info, meta.recipe.get("data", {}).get("leak", "none"), frames)
         return evaluate_stream(file, recording, frames=frames, lpips=asked.lpips, progress=progress_on("frame")), damage
     finally:
         recording.close()
@@ -190,7 +190,6 @@ def _of_files(
     found = resolve_recipe("hold", catalog.recipe_path, files, options.overrides(None, scale=other.scale)).recipe
     recording = open_recording(source, found, catalog)
     try:
-        asked.fits(recording.info, found.data.leak)
         if other.ply_sequence is not None:
             # What the files of others were trained on is black, unless they or a recipe say otherwise.
             behind = (0.0, 0.0, 0.0) if found.background == "auto" else found.background
@@ -200,6 +199,7 @@ def _of_files(
             shown = Renders(other.renders, recording.info, other.first)
         low, high = asked.frames
         frames = [t for t in shown.frames if t >= (low or 0) and (high is None or t < high)]
+        asked.fits(recording.info, found.data.leak, frames)
         evaluation = evaluate_frames(shown, recording, frames=frames, lpips=asked.lpips, progress=progress_on("frame"))
     finally:
         recording.close()

@@ -92,8 +92,8 @@ class Evaluation:
         frames = sorted({view.frame for view in self.views})
         return {t: mean(getattr(v, name) for v in self.views if v.frame == t) for t in frames}
 
-    def to_json(self) -> str:
-        """Return everything as JSON; nan and inf become null."""
+    def to_json(self, protocol: Mapping[str, Any] | None = None) -> str:
+        """Return everything as JSON; nan and inf become null. ``protocol``: the numbers of a published protocol."""
         unknown = ("extra",) if self.lpips_variant else ("lpips", "static_lpips", "extra")
         views = [{k: finite_or_none(v) for k, v in asdict(view).items() if k not in unknown} for view in self.views]
         for row, view in zip(views, self.views, strict=True):
@@ -102,6 +102,8 @@ class Evaluation:
         if self.lpips_variant:
             variants["lpips_variant"] = self.lpips_variant
         data = {**variants, "renderer": self.renderer, "sigmas": dict(self.sigmas), "views": views}
+        if protocol is not None:
+            data["protocol"] = dict(protocol)
         return json.dumps(data, indent=1, allow_nan=False)
 
     def table(self) -> str:

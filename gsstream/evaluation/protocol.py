@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -49,13 +49,14 @@ def find_protocol(name: str) -> EvaluationProtocol:
     return PROTOCOLS[name]
 
 
-def check_protocol(name: str, info: SourceInfo, leak: str) -> None:
+def check_protocol(name: str, info: SourceInfo, leak: str, frames: Sequence[int]) -> None:
     """Refuse what is measured otherwise than the protocol says.
 
     Arguments:
         name: of the protocol.
         info: the recording as it was used, after scale and split.
         leak: ``data.leak`` of the run: what its test cameras gave to it.
+        frames: to be evaluated, ascending: the first one and those after it, at most as many as the protocol has.
 
     Raises InputError, and UnknownName for another protocol.
     """
@@ -69,20 +70,16 @@ def check_protocol(name: str, info: SourceInfo, leak: str) -> None:
     for what, (expected, got) in found.items():
         if expected != got:
             raise InputError(f"--protocol {name}: {what}: expected {expected}, got {got}; {wanted.how}")
+    if list(frames) != list(range(len(frames))) or len(frames) > wanted.frames:
+        raise InputError(
+            f"--protocol {name}: frames: expected 0 to at most {wanted.frames - 1}, got {frames[0]} to {frames[-1]}; "
+            f"say --frames 0:{wanted.frames}"
+        )
 
 
 def protocol_numbers(name: str, evaluation: Evaluation) -> dict[str, Any]:
-    """Return what the protocol reports: means over test cameras and frames, the first included.
-
-    Raises InputError where other frames were evaluated than those from the first one on, or more than the protocol has.
-    """
-    wanted, frames = find_protocol(name), sorted(evaluation.series("psnr"))
-    if frames != list(range(len(frames))) or len(frames) > wanted.frames:
-        got = f"{frames[0]} to {frames[-1]}" if frames else "none"
-        raise InputError(
-            f"--protocol {name}: frames: expected 0 to at most {wanted.frames - 1}, got {got}; "
-            f"say --frames 0:{wanted.frames}"
-        )
+    """Return what the protocol reports: means over test cameras and frames, the first included."""
+    wanted, frames = find_protocol(name), {view.frame for view in evaluation.views}
     names = ("psnr", "ssim") if evaluation.lpips_variant is None else ("psnr", "ssim", "lpips")
     means = {key: mean(getattr(view, key) for view in evaluation.views) for key in names}
     return {"name": name, "frames": len(frames), "of_frames": wanted.frames, "source": wanted.source, **means}

@@ -184,6 +184,12 @@ def hostile_stream(path, **changes):
     return path
 
 
+def test_a_stream_whose_recipe_is_empty_is_compared_like_others(tmp_path, capsys) -> None:
+    path = hostile_stream(tmp_path / "s.gss")
+    assert run_command(["evaluate", str(path), "--source", SOURCE]) == 2
+    assert "the recording does not fit the stream" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "uri", ["watch:DIR?timeout=86400", "disturbed:gain=2:watch:DIR", "watch:", "disturbed::watch:x"]
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -35,7 +36,7 @@ class Change:
         """Share of changed tiles over all views."""
         return float(self.tiles.float().mean()) if self.tiles.numel() else 0.0
 
-    @property
+    @cached_property  # every iteration asks for it
     def dilated(self) -> torch.Tensor:
         """[V, ceil(H / 16), ceil(W / 16)] bool: tiles that changed, and those beside one that did."""
         return torch.nn.functional.max_pool2d(self.tiles[:, None].float(), 3, 1, 1)[:, 0] > 0
@@ -96,10 +97,12 @@ def detect_changed_tiles(previous: Frame, frame: Frame, threshold: float) -> Cha
     def of(view: int) -> BoolArray:
         return _changed(previous.image(view), frame.image(view), threshold)
 
-    cameras = frame.cameras
-    # Two views at a time need the memory of two, and in small pictures threads take longer than they save.
-    with ThreadPoolExecutor(processors() if is_large(cameras.width) else 1) as pool:
-        tiles = list(pool.map(of, range(len(cameras))))
+    cameras, views = frame.cameras, range(len(frame.cameras))
+    if is_large(cameras.width):  # in small pictures threads take longer than they save
+        with ThreadPoolExecutor(processors()) as pool:
+            tiles = list(pool.map(of, views))
+    else:
+        tiles = [of(view) for view in views]
     return Change(torch.from_numpy(np.stack(tiles)), cameras.height, cameras.width)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from gsstream.core.errors import InputError
 from gsstream.evaluation.records import FrameRecord, record_of
-from gsstream_lab.report.quantities import QUANTITIES, values_of
+from gsstream_lab.report.quantities import QUANTITIES, spread, values_of
 from gsstream_lab.sweep.table import TableData, read_table
 
 
@@ -51,8 +51,7 @@ class Group:
 
     def spread(self, key: str) -> float:
         """Return the standard deviation over seeds; nan with a single one."""
-        values = [run.values[key] for run in self.runs]
-        return statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else math.nan
+        return spread([run.values[key] for run in self.runs])
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -77,6 +78,11 @@ def values_of(records: Sequence[FrameRecord], row: Row) -> dict[str, float]:
     """Return every quantity of one run; nan for what was not measured."""
     summary, later = summarise(records), row["frames"][1:]
     return {quantity.key: quantity.value(summary, later, row) for quantity in QUANTITIES}
+
+
+def spread(values: Sequence[float]) -> float:
+    """Return the standard deviation over seeds; nan with a single one, or when one did not measure it."""
+    return statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else math.nan
 
 
 def cell(key: str, value: float, spread: float = math.nan) -> str:

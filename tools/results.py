@@ -1,13 +1,21 @@
-"""Numbers of the results pages: from tables of sweeps to docs/results/data, and from there into the pages.
+"""Numbers of the results pages: from plans of sweeps to docs/results/data, and from there into the pages.
 
-    python -m tools.results take protocol runs/protocol --commit 5027d420
+    python -m tools.results run --data DATA --out RUNS [NAME ...]
+    python -m tools.results take NAME SWEEP --commit HASH
     python -m tools.results fill [--check]
 
-The first writes the numbers of every finished run of a sweep to ``docs/results/data/protocol.jsonl``, one run a line.
-The second fills in every table of a page that says where its rows are, between two comments:
+The first runs the plans of ``configs/sweeps/results`` one after the other (or goes on with them), takes their numbers
+and fills in the pages. The second takes the numbers of one sweep that ran elsewhere: one run a line, in
+``docs/results/data/NAME.jsonl``, where rows that the sweep does not hold stay as they are. The third fills in every
+table of a page between two comments, of all rows of some files or of those with some names only:
 
     <!-- rows of protocol, protocol-peers: psnr_first psnr kb -->
+    <!-- rows of components, only 1-dense 5-hfp: psnr kb -->
     <!-- end of rows -->
+
+and every number within a sentence: a quantity of a run, or its difference or ratio to the same of another run:
+
+    <!-- protocol-peers: comgs-l kb / s2gs-edge -->2.4<!-- end --> times the bytes
 
 Rows of one name are runs with different seeds, of which mean and standard deviation are shown. With ``--check`` nothing
 is written, and a page that differs from its data is named (exit code 1).
@@ -20,18 +28,28 @@ import json
 import math
 import re
 import statistics
-from collections.abc import Sequence
+import subprocess
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from gsstream_lab.report.groups import read_sweep_data
+from gsstream_lab.report.groups import Run, read_sweep_data
 from gsstream_lab.report.quantities import BY_KEY, cell, spread
 
 from gsstream.core.errors import InputError
 from gsstream.evaluation.summary import format_table
 
-PAGES = Path(__file__).parents[1] / "docs" / "results"
-TABLE = re.compile(r"<!-- rows of (?P<files>[\w, -]+?): (?P<keys>[\w ]+?) -->\n(?P<rows>.*?)<!-- end of rows -->", re.S)
+ROOT = Path(__file__).parents[1]
+PAGES, PLANS = ROOT / "docs" / "results", ROOT / "configs" / "sweeps" / "results"
+TABLE = re.compile(
+    r"<!-- rows of (?P<files>[\w, -]+?)(, only (?P<only>[^:]+))?: (?P<keys>[\w ]+?) -->\n"
+    r"(?P<rows>.*?)<!-- end of rows -->",
+    re.S,
+)
+NUMBER = re.compile(
+    r"<!-- (?P<file>[\w-]+): (?P<name>\S+) (?P<key>\w+)( (?P<sign>[-/]) (?P<other>\S+))? -->"
+    r"(?P<value>[^<]*)<!-- end -->"
+)
 
 Row = dict[str, Any]
 
@@ -48,8 +66,30 @@ def rows_of_sweep(folder: Path, commit: str) -> list[Row]:
             machine = {"processor": facts["processor"], "processors": facts["processors_usable"]}
             frames = len(run.row["frames"])
             rows.append({"scene": group.scene, "name": group.label, "seed": run.seed, "frames": frames, **values,
-                         **origin, **machine})  # fmt: skip
+                         **_phases(run), **origin, **machine})  # fmt: skip
     return rows
+
+
+def _phases(run: Run) -> dict[str, float]:
+    """Return the mean wall milliseconds of every phase of the frames after the first, as ``ms_motion``."""
+    later = [frame["seconds"] for frame in run.row["frames"][1:]]
+    names = dict.fromkeys(name for seconds in later for name in seconds)
+    means = {name: statistics.fmean(seconds.get(name, 0.0) for seconds in later) for name in names}
+    return {f"ms_{name}": float(f"{1e3 * mean:.4g}") for name, mean in means.items()}
+
+
+def _which(row: Row) -> tuple[Any, ...]:
+    return tuple(row.get(key) for key in ("scene", "name", "frames", "seed"))
+
+
+def merged(before: Sequence[Row], now: Sequence[Row]) -> list[Row]:
+    """Return the rows of both, in their order; a row that was taken before and is the same run keeps its commit."""
+    known = {_which(row): row for row in before}
+    for row in now:
+        old = known.get(_which(row))
+        same = old is not None and old["date"] == row["date"]
+        known[_which(row)] = {**row, "commit": old["commit"]} if old is not None and same else row
+    return list(known.values())
 
 
 def read_rows(name: str, folder: Path) -> list[Row]:
@@ -60,35 +100,89 @@ def read_rows(name: str, folder: Path) -> list[Row]:
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
+def title_of(key: str) -> str:
+    """Return the head of a column: of a quantity, its title; of anything else, its key in words."""
+    if key in BY_KEY:
+        return str(BY_KEY[key].title)
+    return f"{key.removeprefix('ms_')}, ms" if key.startswith("ms_") else key.replace("_", " ")
+
+
+def entry(key: str, values: Sequence[Any]) -> str:
+    """Return a cell of a table: mean and standard deviation over seeds; texts and counts as they stand."""
+    if key in BY_KEY:
+        return str(cell(key, statistics.fmean(values), spread(values)))
+    if len(set(map(str, values))) == 1 and not isinstance(values[0], float):
+        return str(values[0])
+    mean = statistics.fmean(values)
+    return "-" if math.isnan(mean) else f"{mean:.0f}" if abs(mean) >= 10 else f"{mean:.3g}"
+
+
 def table_of(rows: Sequence[Row], keys: Sequence[str]) -> str:
-    """Return a Markdown table with a line for each scene, name and number of frames, in the order of the rows."""
-    lines: dict[tuple[str, str, int], list[Row]] = {}
-    for row in rows:
-        lines.setdefault((row["scene"], row["name"], row["frames"]), []).append(row)
-    scenes = len({scene for scene, _, _ in lines}) > 1
-    table = [["run", *(["recording"] if scenes else []), "frames", "seeds", *(BY_KEY[key].title for key in keys)]]
-    for (scene, name, frames), runs in lines.items():
-        cells = []
-        for key in keys:
-            values = [run.get(key, math.nan) for run in runs]
-            cells.append(cell(key, statistics.fmean(values), spread(values)))
-        table.append([f"`{name}`", *([scene] if scenes else []), str(frames), str(len(runs)), *cells])
+    """Return a Markdown table with a line for each scene, name and number of frames, in the order of the rows.
+
+    Rows without a name are a line each, and their columns the keys alone.
+    """
+    lines: dict[tuple[Any, ...], list[Row]] = {}
+    for number, row in enumerate(rows):
+        lines.setdefault(_which(row)[:3] if "name" in row else (number,), []).append(row)
+    named = all("name" in row for row in rows)
+    scenes = named and len({row["scene"] for row in rows}) > 1
+    heads = ["run", *(["recording"] if scenes else []), "frames", "seeds"] if named else []
+    table = [[*heads, *map(title_of, keys)]]
+    for found, runs in lines.items():
+        cells = [entry(key, [run.get(key, math.nan) for run in runs]) for key in keys]
+        facts = [f"`{found[1]}`", *([found[0]] if scenes else []), str(found[2]), str(len(runs))] if named else []
+        table.append([*facts, *cells])
     return format_table(table)
 
 
+def number_of(found: re.Match[str], rows: Sequence[Row]) -> str:
+    """Return what stands in a sentence: a mean over seeds, or the difference or ratio of two. Raises InputError."""
+
+    def mean_of(name: str) -> float:
+        scene, _, run = name.rpartition("/")
+        values = [row.get(found["key"]) for row in rows if row["name"] == run and scene in ("", row["scene"])]
+        if not values or None in values:
+            raise InputError(f"{found[0]}: there is no such number in {found['file']}.jsonl")
+        return statistics.fmean(value for value in values if value is not None)
+
+    value = mean_of(found["name"])
+    if found["sign"] == "/":
+        ratio = value / mean_of(found["other"])
+        return f"{ratio:.0f}" if ratio >= 10 else f"{ratio:.1f}"
+    if found["sign"] == "-":
+        return f"{abs(value - mean_of(found['other'])):{BY_KEY[found['key']].form.lstrip('+')}}"
+    return cell(found["key"], value) if found["key"] in BY_KEY else f"{value:.3g}"
+
+
 def filled(text: str, folder: Path) -> str:
-    """Return a page with every table made from its data. Raises InputError for rows or quantities it does not know."""
+    """Return a page with its tables and numbers made from the data. Raises InputError for what it does not know."""
 
     def made(found: re.Match[str]) -> str:
         files, keys = [name.strip() for name in found["files"].split(",")], found["keys"].split()
-        unknown = [key for key in keys if key not in BY_KEY]
+        rows = [row for name in files for row in read_rows(name, folder)]
+        unknown = [key for key in keys if key not in BY_KEY and not any(key in row for row in rows)]
         if unknown:
             raise InputError(f"rows of {found['files']}: unknown quantities {unknown}; known: {', '.join(BY_KEY)}")
-        rows = [row for name in files for row in read_rows(name, folder)]
+        if found["only"] is not None:
+            rows = _only(rows, found["only"].split())
         head = found[0].split("\n", 1)[0]
         return f"{head}\n{table_of(rows, keys)}\n<!-- end of rows -->"
 
-    return TABLE.sub(made, text)
+    def number(found: re.Match[str]) -> str:
+        start = found[0][: found.start("value") - found.start()]
+        return f"{start}{number_of(found, read_rows(found['file'], folder))}<!-- end -->"
+
+    return NUMBER.sub(number, TABLE.sub(made, text))
+
+
+def _only(rows: Sequence[Row], names: Sequence[str]) -> list[Row]:
+    """Return the rows of some names, in the order of the names; ``~`` stands for the space within a name."""
+    wanted = [name.replace("~", " ") for name in names]
+    known = {row["name"] for row in rows}
+    if missing := set(wanted) - known:
+        raise InputError(f"only {sorted(missing)}: there are no such rows; known: {sorted(known)}")
+    return [row for name in wanted for row in rows if row["name"] == name]
 
 
 def fill(folder: Path, check: bool) -> list[Path]:
@@ -104,28 +198,57 @@ def fill(folder: Path, check: bool) -> list[Path]:
     return differ
 
 
+def take(name: str, sweep: Path, commit: str) -> None:
+    """Write the numbers of a sweep to its data file."""
+    path = PAGES / "data" / f"{name}.jsonl"
+    path.parent.mkdir(exist_ok=True)
+    rows = merged(read_rows(name, PAGES) if path.is_file() else [], rows_of_sweep(sweep, commit))
+    path.write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")
+    print(f"{len(rows)} runs in {path}")
+
+
+def run(names: Iterable[str], data: Path, out: Path) -> None:
+    """Run plans, one core a run, and take their numbers. Raises InputError where no commit can be named for them."""
+
+    def git(*command: str) -> str:
+        return subprocess.run(["git", *command], cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
+
+    if git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs/results"):
+        raise InputError("the working tree differs from its last commit, which the numbers are to name; commit first")
+    for name in names:
+        command = ["gsstream", "sweep", str(PLANS / f"{name}.yaml"), "--data", str(data), "--out", str(out / name)]
+        subprocess.run([*command, "--workers", "1"], check=False)  # what failed is in the sweep's table
+        take(name, out / name, git("rev-parse", "--short", "HEAD"))
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one of the two commands; return the exit code."""
+    """Run one of the commands; return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m tools.results", description=__doc__.split("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
-    take = commands.add_parser("take", help="write the numbers of a finished sweep to docs/results/data")
-    take.add_argument("name")
-    take.add_argument("sweep", type=Path)
-    take.add_argument("--commit", required=True, help="of the code that ran")
-    pages = commands.add_parser("fill", help="make the tables of the pages from the data")
+    all_plans = sorted(path.stem for path in PLANS.glob("*.yaml"))
+    running = commands.add_parser(
+        "run", help="run plans, take their numbers, fill in the pages"
+    )
+    running.add_argument("names", nargs="*", metavar="NAME", help=f"all of {', '.join(all_plans)}, when left out")
+    running.add_argument("--data", type=Path, required=True, help="folder of the recordings")
+    running.add_argument("--out", type=Path, required=True, help="folder of the sweeps; those there are continued")
+    taking = commands.add_parser("take", help="write the numbers of a finished sweep to docs/results/data")
+    taking.add_argument("name")
+    taking.add_argument("sweep", type=Path)
+    taking.add_argument("--commit", required=True, help="of the code that ran")
+    pages = commands.add_parser("fill", help="make the tables and numbers of the pages from the data")
     pages.add_argument("--check", action="store_true", help="only say which pages differ")
     given = parser.parse_args(arguments)
     if given.command == "take":
-        rows = rows_of_sweep(given.sweep, given.commit)
-        path = PAGES / "data" / f"{given.name}.jsonl"
-        path.parent.mkdir(exist_ok=True)
-        path.write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")
-        print(f"{len(rows)} runs in {path}")
+        take(given.name, given.sweep, given.commit)
         return 0
-    differ = fill(PAGES, given.check)
+    if given.command == "run":
+        run(given.names or all_plans, given.data, given.out)
+    check = given.command == "fill" and given.check
+    differ = fill(PAGES, check)
     for page in differ:
-        print(f"{page.name} {'differs from its data' if given.check else 'made from its data'}")
-    return 1 if given.check and differ else 0
+        print(f"{page.name} {'differs from its data' if check else 'made from its data'}")
+    return 1 if check and differ else 0
 
 
 if __name__ == "__main__":

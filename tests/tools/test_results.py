@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from pathlib import Path
 
 import pytest
 
 from gsstream.core.errors import InputError
-from tools.results import PAGES, TABLE, fill, filled, read_rows, table_of
+from tools.results import NUMBER, PAGES, PLANS, TABLE, fill, filled, merged, read_rows, run, table_of
 
 RUN = {"scene": "a", "name": "edge", "seed": 0, "frames": 3, "psnr": 30.0, "kb": 2.0}
 
@@ -20,6 +21,8 @@ def test_tables_of_the_pages_are_made_from_their_data() -> None:
     assert sum(text.count("<!-- rows of ") for text in pages) == sum(len(TABLE.findall(text)) for text in pages)
     known = {path.stem for path in (PAGES / "data").glob("*.jsonl")}
     used = {name.strip() for text in pages for found in TABLE.finditer(text) for name in found["files"].split(",")}
+    used |= {found["file"] for text in pages for found in NUMBER.finditer(text)}
+    assert sum(text.count("<!-- end -->") for text in pages) == sum(len(NUMBER.findall(text)) for text in pages)
     assert known == used, "data that no page shows, or the other way round"
 
 
@@ -49,6 +52,84 @@ def test_seeds_are_one_line_and_what_was_not_measured_is_a_dash() -> None:
     assert "recording" in table_of([RUN, {**RUN, "scene": "b"}], ["kb"])
 
 
+def test_rows_without_a_name_are_a_line_each_and_show_what_stands_in_them() -> None:
+    rows = [
+        {"board": "a", "worst_ms": 3, "ms_code": 12.34, "dropped": 0},
+        {"board": "b", "ms_code": 0.123, "dropped": 7},
+    ]
+    lines = [
+        [part.strip() for part in line.strip("|").split("|")]
+        for line in table_of(rows, ["board", "ms_code", "dropped"]).splitlines()
+    ]
+    assert lines[0] == ["board", "code, ms", "dropped"]
+    assert lines[2:] == [["a", "12", "0"], ["b", "0.123", "7"]]
+
+
+def page_of(folder: Path, rows: list[dict[str, object]], text: str) -> str:
+    """A page filled in from a data file called ``some``."""
+    (folder / "data").mkdir()
+    (folder / "data" / "some.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows))
+    return filled(text, folder)
+
+
+def test_a_table_may_show_some_names_in_an_order_of_its_own(tmp_path: Path) -> None:
+    rows = [{**RUN, "name": name} for name in ("a", "b x=1", "c")]
+    text = page_of(tmp_path, rows, "<!-- rows of some, only c b~x=1: psnr -->\n<!-- end of rows -->")
+    assert [line.split("|")[1].strip() for line in text.splitlines()[3:-1]] == ["`c`", "`b x=1`"]
+    with pytest.raises(InputError, match="only \\['d'\\]: there are no such rows; known: \\['a'"):
+        filled("<!-- rows of some, only d: psnr -->\n<!-- end of rows -->", tmp_path)
+
+
+def test_numbers_in_sentences_are_means_differences_and_ratios(tmp_path: Path) -> None:
+    rows = [
+        RUN,
+        {**RUN, "seed": 1, "psnr": 30.5},
+        {**RUN, "name": "full", "kb": 31.0},
+        {**RUN, "scene": "b", "psnr": 20.0},
+    ]
+    text = (
+        "<!-- some: a/edge psnr --><!-- end --> dB, <!-- some: full psnr - a/edge -->9<!-- end --> dB less for "
+        "<!-- some: full kb / a/edge --><!-- end --> times"
+    )
+    found = page_of(tmp_path, rows, text)
+    assert NUMBER.sub(r"\g<value>", found) == "30.25 dB, 0.25 dB less for 16 times"
+    with pytest.raises(InputError, match="there is no such number in some"):
+        filled("<!-- some: nobody psnr --><!-- end -->", tmp_path)
+
+
+def test_rows_taken_twice_keep_the_commit_that_ran_them() -> None:
+    old = [{**RUN, "date": "monday", "commit": "a"}, {**RUN, "name": "gone", "date": "monday", "commit": "a"}]
+    new = [{**RUN, "date": "monday", "commit": "b"}, {**RUN, "seed": 1, "date": "tuesday", "commit": "b"}]
+    assert [(row["name"], row["seed"], row["commit"]) for row in merged(old, new)] == [
+        ("edge", 0, "a"), ("gone", 0, "a"), ("edge", 1, "b"),
+    ]  # fmt: skip
+    again = [{**RUN, "date": "tuesday", "commit": "b", "psnr": 31.0}]
+    assert merged(old, again)[0]["commit"] == "b"
+
+
+def test_every_plan_has_its_name_and_every_table_of_runs_its_plan() -> None:
+    for plan in PLANS.glob("*.yaml"):
+        assert f"name: {plan.stem}\n" in plan.read_text(encoding="utf-8"), plan
+    for path in (PAGES / "data").glob("*.jsonl"):
+        if "recipe" in read_rows(path.stem, PAGES)[0]:
+            assert (PLANS / f"{path.stem}.yaml").is_file(), path
+
+
+def test_a_tree_that_no_commit_names_runs_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def git(*command: str) -> None:
+        subprocess.run(["git", "-c", "user.name=a", "-c", "user.email=a@b", *command], cwd=tmp_path, check=True)
+
+    git("init", "-q")
+    (tmp_path / "code.py").write_text("a = 1\n")
+    git("add", "code.py")
+    git("commit", "-qm", "first")
+    (tmp_path / "code.py").write_text("a = 2\n")
+    monkeypatch.setattr("tools.results.ROOT", tmp_path)
+    with pytest.raises(InputError, match="commit first"):
+        run(["demo"], tmp_path, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_number_changed_by_hand_is_found_and_put_back(tmp_path: Path) -> None:
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "some.jsonl").write_text(json.dumps(RUN) + "\n")
@@ -68,8 +149,8 @@ def test_a_number_changed_by_hand_is_found_and_put_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("head", "said"), [("nowhere: psnr", "found no file"), ("nowhere: colour", "unknown quantities \\['colour'\\]")]
+    ("head", "said"), [("nowhere: psnr", "found no file"), ("some: colour", "unknown quantities \\['colour'\\]")]
 )
 def test_rows_and_quantities_that_are_not_there_are_refused(tmp_path: Path, head: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
-        filled(f"<!-- rows of {head} -->\n<!-- end of rows -->", tmp_path)
+        page_of(tmp_path, [RUN], f"<!-- rows of {head} -->\n<!-- end of rows -->")

@@ -19,9 +19,9 @@ ENCODER = ("torch", "kornia", "scipy", "matplotlib")
 #: Extra -> the parts and methods of this project's other distributions that it brings.
 SHIPPED: Mapping[str, tuple[str, ...]] = {
     "s2gs": (
-        "method/s2gs", "method/s2gs-edge", "method/s2gs-fast", "method/s2gs-paper", "confidence/error-aware",
-        "confidence/noise-normalised", "confidence/uniform-random", "confidence/view-gradient", "gate/gumbel-sigmoid",
-        "propagation/hierarchical-max", "propagation/selective-leaf",
+        "method/s2gs", "method/s2gs-edge", "method/s2gs-fast", "method/s2gs-paper",
+        "confidence/uniform-random", "confidence/view-gradient", "gate/gumbel-sigmoid",
+        "propagation/hierarchical-max",
         "regularizer/expected-sparsity", "structure/octree", "update/latent",
         "command/sweep", "command/report", "command/compare", "command/tune", "command/search",
         "command/gap", "command/left-behind", "command/bench",

@@ -14,7 +14,7 @@ from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.shapes import FloatArray, IntArray
 
 #: Fractional bits of each attribute (raw units); of colours: of their luma, chroma has one bit less. Chosen on real
-#: scenes so that all together lose a few hundredths of a dB; see docs/results/trade.md.
+#: scenes so that all together lose a few hundredths of a dB.
 KEY_BITS: Mapping[str, int] = {"quats": 7, "scales": 4, "opacities": 3, "sh0": 6, "shN": 7}
 #: Largest magnitude of a code. Sums of three codes of the colour transform stay exact in float32.
 MAX_CODE = 1 << 20

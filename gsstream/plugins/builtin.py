@@ -24,7 +24,6 @@ def gsstream_components() -> list[ComponentSpec]:
         _part("update", "additive", "parts.update.additive:Additive", "gated change added to raw attributes"),
         _part("update", "none", "parts.update.none:NoUpdate", "no residual: motion and growth alone"),
         _part("motion", "still", "parts.motion.none:Still", "nothing is carried along"),
-        _part("motion", "coasting", "parts.motion.constant_velocity:Coasting", "what moved goes on moving"),
         _part("motion", "rigid", "parts.motion.rigid:Rigid", "one fitted rigid motion per group"),
         _part("growth", "copies", "parts.growth.copying:Copies", "Gaussians copied where the gradient is large"),
         _part("growth", "none", "parts.growth.none:NoGrowth", "nothing is added and nothing is removed"),

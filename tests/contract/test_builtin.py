@@ -147,10 +147,6 @@ def test_names_and_meanings_of_checks() -> None:
 #: Part with its default settings -> what it claims beyond the record of its kind; parts of other kinds claim nothing.
 CLAIMS: dict[str, dict[str, Any]] = {
     "confidence/error-gradient": {"needs_renderer": True, "floor": 1.0},
-    "confidence/error-aware": {"needs_renderer": True, "floor": 1.0, "finds_motion": True},
-    "confidence/noise-normalised": {
-        "needs_renderer": True, "floor": log(1e-3), "finds_motion": True, "monotone_in_change": True,
-    },
     "confidence/uniform": {"brightness": 0.0},
     "confidence/uniform-random": {"floor": log(1e3)},
     "confidence/view-gradient": {
@@ -165,9 +161,6 @@ CLAIMS: dict[str, dict[str, Any]] = {
     "propagation/ft-pruning": {"idempotent": True, "differentiable": True, "parent_bound": True},
     "propagation/group-max": {"conservative": True, "idempotent": True, "differentiable": True, "normalised": True},
     "propagation/hierarchical-max": {
-        "conservative": True, "idempotent": True, "differentiable": True, "normalised": True, "parent_bound": True,
-    },
-    "propagation/selective-leaf": {
         "conservative": True, "idempotent": True, "differentiable": True, "normalised": True, "parent_bound": True,
     },
     "regularizer/expected-sparsity": {

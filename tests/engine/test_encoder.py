@@ -48,13 +48,12 @@ REFINING: Mapping[str, Any] = {
 MOVING: Mapping[str, Any] = {"motion": "rigid", "motion.epochs": 1, "motion.hold": 0.1}
 CASES: Mapping[str, Mapping[str, Any]] = {
     "still": {"motion": "still"},
-    "coasting": {"motion": "coasting"},
     "rigid": {**MOVING},
-    "keys": {"motion": "coasting", "codec.key_interval": 2},
-    "growing": {**GROWING, "motion": "coasting"},
+    "keys": {**MOVING, "codec.key_interval": 2},
+    "growing": {**GROWING, **MOVING},
     "growing rigid with keys": {**GROWING, **MOVING, "codec.key_interval": 3},
     "refined": {**REFINING, **MOVING},
-    "growing refined with keys": {**GROWING, **REFINING, "motion": "coasting", "codec.key_interval": 2},
+    "growing refined with keys": {**GROWING, **REFINING, **MOVING, "codec.key_interval": 2},
 }
 
 
@@ -291,19 +290,19 @@ def test_a_listener_that_fails_is_not_hidden_and_the_frame_can_be_sent_again() -
             refuse.clear()
             raise OSError("no space left on device")
 
-    made = encoder("coasting", Callbacks(packet=full))
+    made = encoder("rigid", Callbacks(packet=full))
     made.encode(frames()[0])
     before = made.state
     with pytest.raises(OSError, match="no space left"):
         made.encode(frames()[1])
     assert made.state is before
     sent = [made.encode(frame) for frame in frames()[1:]]
-    assert packets(sent) == packets(whole("coasting"))[1:]
+    assert packets(sent) == packets(whole("rigid"))[1:]
 
 
 def test_a_rig_needs_no_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Images from anywhere: the seeds are swept from them, and the stream plays."""
-    rig, settings = frames()[0].cameras, {**TINY, "first_frame.points": "auto", "motion": "coasting"}
+    rig, settings = frames()[0].cameras, {**TINY, "first_frame.points": "auto", **MOVING}
     made = encoder_for_rig("s2gs-edge", rig, fps=25.0, settings=settings, name="studio")
     steps = tuple(made.encode(frame) for frame in frames()[:3])
     assert steps[0].status == "key"

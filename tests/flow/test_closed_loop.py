@@ -22,7 +22,7 @@ from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.rng import Rng
 from gsstream.engine.method.checked import difference_between
 from gsstream.engine.step import frame_step as step_module
-from gsstream.parts.motion.constant_velocity import Coasting
+from gsstream.parts.motion.rigid import Rigid
 from gsstream.parts.render.reference import ReferenceRenderer
 from gsstream.parts.render.work import FitContext
 from gsstream.player.playback import Playback
@@ -59,12 +59,9 @@ RUNS = {
     "s2gs-edge": Run(),
     "rows come and go": Run("dense", grows=True, shows=lambda lines: _counts(lines) == [10, 0, 10, 0, 10]),
     "rows come and go behind shared gates": Run(grows=True, shows=lambda lines: _counts(lines) == [10, 0, 10, 0, 10]),
-    "growing and coasting": Run(
-        settings={**GROWING, "motion": "coasting"},
-        shows=lambda lines: _any(lines, "moving_groups") and _any(lines, "added_gaussians"),
-    ),
     "growing and rigid": Run(
-        settings={**GROWING, "motion": "rigid", "motion__epochs": 1}, shows=lambda lines: _any(lines, "moving_groups")
+        settings={**GROWING, "motion": "rigid", "motion__epochs": 1},
+        shows=lambda lines: _any(lines, "moving_groups") and _any(lines, "added_gaussians"),
     ),
     "trimmed": Run(
         flags=("--budget", "size=300B"),
@@ -264,51 +261,53 @@ SPOILED = {
 
 
 #: Of the runs that are spoiled, and of the one that is not.
-COASTING = {"method": "s2gs-edge", "motion": "coasting", "stream__epochs": 1}
+MOVING = {"method": "s2gs-edge", "motion": "rigid", "motion__epochs": 1, "motion__hold": 0.1, "stream__epochs": 1}
 
 
 @pytest.fixture(scope="module")
-def two_frames(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bytes]:
-    """The folder of a run as it is when frame 2 looks for its motion, and the stream of the undisturbed run."""
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int, bytes]:
+    """The folder of a run as it is when the first group moves after frame 1, that frame, and the undisturbed stream."""
     folder = tmp_path_factory.mktemp("undisturbed")
-    begun, sound = folder / "begun", Coasting.propose
+    begun, frame, sound = folder / "begun", list[int](), Rigid.propose
 
-    def propose(self: Coasting, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> Any:
+    def propose(self: Rigid, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> Any:
         found = sound(self, scene, work, rng)
-        if found and not begun.exists():
+        if work.index > 1 and found and found[0].moving.any() and not begun.exists():
             shutil.copytree(folder / "run", begun)
+            frame.append(work.index)
         return found
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Coasting, "propose", propose)
-        return begun, encode(folder / "run", "--frames", "4", **COASTING)
+        patch.setattr(Rigid, "propose", propose)
+        whole = encode(folder / "run", "--frames", "4", **MOVING)
+        return begun, frame[0], whole
 
 
 @pytest.mark.parametrize("how", SPOILED)
 def test_a_motion_that_does_not_fit_ends_in_one_sentence(
-    two_frames: tuple[Path, bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str], how: str
+    undisturbed: tuple[Path, int, bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str], how: str
 ) -> None:
     """Nothing written is lost, and with the part mended the run goes on to the bytes of an undisturbed one."""
     spoil, message = SPOILED[how]
-    sound = Coasting.propose
-    begun, undisturbed = two_frames
+    sound = Rigid.propose
+    begun, frame, whole = undisturbed
     run = shutil.copytree(begun, tmp_path / "run")
 
-    def propose(self: Coasting, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> Any:
+    def propose(self: Rigid, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> Any:
         found = sound(self, scene, work, rng)
         return spoil(found[0]) if found else found
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Coasting, "propose", propose)
-        assert run_command(arguments(run, "--resume", "--frames", "4", **COASTING)) == 1
+        patch.setattr(Rigid, "propose", propose)
+        assert run_command(arguments(run, "--resume", "--frames", "4", **MOVING)) == 1
     err = capsys.readouterr().err
     # The second line says what there is and how to go on.
     assert len([line for line in err.splitlines() if not line.startswith("the stream in ")]) == 1, err
-    assert err.startswith("error: motion 'Coasting' (from gsstream) failed at frame 2: ")
+    assert err.startswith(f"error: motion 'Rigid' (from gsstream) failed at frame {frame}: ")
     assert message in err
     with Playback(run / "stream.gss") as playback:
-        assert list(playback.frames) == [0, 1]
-    assert len(metrics(run)) == 2
+        assert list(playback.frames) == list(range(frame))
+    assert len(metrics(run)) == frame
     if how != "numbers":
         return  # to the stream and to those who resume it, all of these are the same
-    assert encode(run, "--resume", "--frames", "4", **COASTING) == undisturbed
+    assert encode(run, "--resume", "--frames", "4", **MOVING) == whole

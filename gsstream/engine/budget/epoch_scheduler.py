@@ -184,8 +184,8 @@ def scheduled(stream: Stream, frame: Frame, budget: FrameBudget | None) -> Sched
 def next_rate_weight(weight: float, expected: float, wanted: float) -> float:
     """Return the weight of the rate after a pass that would send more or fewer bytes than are wanted.
 
-    Bytes fall with about the square root of the weight (docs/results/trade.md), so the first power leads half of the
-    way to the goal; a factor of three a pass is the most that residuals can follow. What was taken back comes slowly
+    Bytes fall with about the square root of the weight, so the first power leads half of the way to
+    the goal; a factor of three a pass is the most that residuals can follow. What was taken back comes slowly
     again, so the way down is half as fast.
     """
     factor = min(max(expected / wanted, 1 / 9), 3.0)

@@ -14,12 +14,12 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.recipe.model import Recipe
 
-#: Interpreter, torch, the renderer and the engine with everything a run imports (measured, docs/results/trade.md).
+#: Interpreter, torch, the renderer and the engine with everything a run imports (measured).
 PROCESS = 310_000_000
 #: Of a training image: the frame, the one before and two read ahead, which wait as bytes or float32.
 WAITING = 4
 #: What is made of images of one camera at a time, in images of float32: renders, gradients, maps of the loss, and the
-#: temporary ones of every phase (measured at widths of 320 and 1352, docs/results/trade.md).
+#: temporary ones of every phase (measured at widths of 320 and 1352).
 WORKING = 8
 #: A Gaussian with its gradients and moments in frame 0; and the copies of a frame step, when there are caches.
 BYTES_PER_GAUSSIAN, BYTES_PER_GAUSSIAN_LATER = 1_700, 700

@@ -21,7 +21,7 @@ WINDOW = 5
 #: Share of a time budget that is planned; the rest is a reserve for delays that cannot be predicted.
 TIME_MARGIN = 0.93
 #: Below this share of a size budget the weight falls; above this multiple it rises. In between the packet is trimmed:
-#: that takes 43 % of the bytes for less than any weight does (docs/results/trade.md).
+#: that takes 43 % of the bytes for less than any weight does.
 SIZE_TARGET, MAX_TRIMMED = 0.94, 2.0
 #: Largest share of the time that is kept for the phases after the passes, while no frame has shown what they cost.
 UNKNOWN_RESERVE = 0.2
@@ -33,7 +33,7 @@ FIXED_SHARE = 0.3
 MOST_EPOCHS = 30
 #: When fewer passes than this fit, it is better to have fewer candidates and more passes.
 MIN_EPOCHS = 4
-#: Weights of the rate that the controller may use; recipes ship 3e-4, which halves the bytes (docs/results/trade.md).
+#: Weights of the rate that the controller may use; recipes ship 3e-4, which halves the bytes.
 MIN_WEIGHT, MAX_WEIGHT = 3e-5, 3e-2
 #: Steps get at most this much coarser.
 MAX_STEP_SCALE = 4.0
@@ -199,7 +199,7 @@ def _weight(budget: Budget, stream: Stream, recent: Sequence[Past]) -> float:
     """The recipe's, or less where the last frame left bytes over.
 
     Never more: a residual that is taxed from the first pass on does not grow to what it should be. To let it grow and
-    to trim the packet is better by far at equal bytes (docs/results/trade.md).
+    to trim the packet is better by far at equal bytes.
     """
     start = stream.rd_lambda or MIN_WEIGHT
     if recent and budget.size is not None:

@@ -1,7 +1,7 @@
 """Constants of the optimisation that no recipe changes: rates of 3DGS, and what keeps a scene tidy.
 
 The rates and the rules of pruning are those of 3DGS (Kerbl et al. 2023); the penalties are gsstream's own, and held-out
-quality is why they are there (docs/results/index.md).
+quality is why they are there.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ DENSIFY_GRADIENT = 3e-4
 #: Share of the iterations after which nothing is densified or pruned any more.
 DENSIFY_UNTIL = 0.6
 #: Shares of the iterations after which what the images would not miss goes: when growth has ended, and once more while
-#: there is time to close the gaps. Earlier, what is pruned grows again (docs/results/trade.md).
+#: there is time to close the gaps. Earlier, what is pruned grows again.
 PRUNE_AT = (0.6, 0.8)
 #: The same where pictures of several sizes follow each other: detail is added until well into the largest ones.
 PYRAMID_DENSIFY_UNTIL, PYRAMID_PRUNE_AT = 0.8, (0.85,)

@@ -1,8 +1,7 @@
 """The first frame: from anchors to Gaussians that a stream can start from.
 
 The schedule is 3DGS's (Kerbl et al. 2023) with gradient-driven densification and opacity pruning; the exposure fit, the
-opacity and scale penalties and the near plane are gsstream's own; held-out quality is why they are there
-(docs/results/index.md).
+opacity and scale penalties and the near plane are gsstream's own; held-out quality is why they are there.
 """
 
 from __future__ import annotations

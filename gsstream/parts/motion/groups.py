@@ -62,12 +62,3 @@ def groups_of_rows(groups: Groups, rows: IntArray, shell: torch.Tensor) -> IntAr
 def _groups_with(groups: Groups, marked: torch.Tensor) -> IntArray:
     """[G] bool: groups that hold a marked row, [N] bool."""
     return np.asarray(np.bincount(groups.group_of[marked.cpu().numpy()], minlength=groups.count) > 0)
-
-
-def displaced_groups(groups: Groups, scene: Scene, share: float) -> IntArray:
-    """Return [G] bool: groups of which the last frame displaced some row, and at least this share of them."""
-    if scene.displacement is None:
-        return np.zeros(groups.count, bool)
-    total = np.bincount(groups.group_of, minlength=groups.count)
-    hit = np.bincount(groups.group_of[scene.displacement.rows], minlength=groups.count)
-    return np.asarray((hit > 0) & (hit >= share * total))

@@ -54,7 +54,6 @@ TINY = [
 CHEAP = [
     "components 1-dense", "components 4-octree", "structure-sparsity structure", "propagation ft-0.80",
     "discretisation binary-released", "confidence constant-zero", "first-frame-noise noise-30",
-    "extensions selective-leaf",
 ]  # fmt: skip
 
 
@@ -162,8 +161,6 @@ def test_every_scene_of_the_paper_has_its_octree_and_three_seeds(catalog: Catalo
     seen = set()
     for table in TABLES:
         config = read_sweep(FOLDER / f"{table}.yaml")
-        if table == "extensions":  # no table of the paper
-            continue
         assert config.seeds == [0, 1, 2], table
         for scene in config.scenes:
             found = scene.set.get("structure.root_exponent", 8), scene.set.get("structure.log_base", 1.5)

@@ -7,13 +7,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from gsstream_s2gs.error_aware import ErrorAware
 from gsstream_s2gs.expected_sparsity import ExpectedSparsity
 from gsstream_s2gs.gumbel_sigmoid import GumbelSigmoid
 from gsstream_s2gs.latent import LatentCode, LatentResidual
-from gsstream_s2gs.noise_normalised import NoiseNormalised
 from gsstream_s2gs.octree import StreamingOctree
-from gsstream_s2gs.selective_leaf import SelectiveLeaf
 from gsstream_s2gs.view_gradient import ViewSpaceGradient
 from pydantic import ValidationError
 from residual_oracle import train_rows
@@ -158,8 +155,6 @@ PARTS = [
     GumbelSigmoid(Gate(noise="gumbel")), GumbelSigmoid(Gate(clamp_gradient=True)),
     GumbelSigmoid(Gate(noise="none", clamp_gradient=True)),
     ExpectedSparsity(Sparsity(reduction="sum", motion="half-mean")),
-    NoiseNormalised(NoiseNormalised.Config(probes=4)), ErrorAware(ErrorAware.Config(budget=0.0)),
-    SelectiveLeaf(SelectiveLeaf.Config(suspect=-1.0, spread=1.0)),
 ]  # fmt: skip
 
 

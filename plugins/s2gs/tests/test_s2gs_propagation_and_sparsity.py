@@ -11,12 +11,11 @@ import torch
 from gsstream_s2gs.expected_sparsity import ExpectedSparsity
 from gsstream_s2gs.gumbel_sigmoid import GumbelSigmoid
 from gsstream_s2gs.hierarchical import HierarchicalMax
-from gsstream_s2gs.selective_leaf import SelectiveLeaf
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from gsstream.api import Hierarchy, Propagation, ShapeError
+from gsstream.api import Hierarchy, ShapeError
 
 
 def forest(parents: list[int], node_of: list[int]) -> Hierarchy:
@@ -30,37 +29,24 @@ def forest(parents: list[int], node_of: list[int]) -> Hierarchy:
     return Hierarchy(torch.tensor(node_of, dtype=torch.int64), torch.tensor(parents), torch.tensor(depth))
 
 
-def walked(logits: list[float], hierarchy: Hierarchy, suspect: float, spread: float, empty: float) -> list[float]:
-    """The definition, node by node, in plain Python; with a ``spread`` of 0 every tree moves as one."""
+def walked(logits: list[float], hierarchy: Hierarchy, empty: float) -> list[float]:
+    """The definition, node by node, in plain Python: the maximum over the tree, or ``empty`` without members."""
     parents, node_of = hierarchy.parent.tolist(), hierarchy.node_of.tolist()
 
-    def above(node: int) -> list[int]:
-        chain = [node]
-        while parents[chain[-1]] != chain[-1]:
-            chain.append(parents[chain[-1]])
-        return chain
+    def root(node: int) -> int:
+        while parents[node] != node:
+            node = parents[node]
+        return node
 
-    def subtree(node: int) -> float:
-        inside = [z for z, n in zip(logits, node_of, strict=True) if node in above(n)]
-        over = parents[node]
-        return max(inside) if inside else empty if over == node else min(empty, subtree(over))
-
-    out = []
-    for node in range(len(parents)):
-        root = above(node)[-1]
-        owners = {n for n in node_of if above(n)[-1] == root}
-        loud = {n for n in owners if max(z for z, m in zip(logits, node_of, strict=True) if m == n) > suspect}
-        out.append(subtree(root if len(loud) >= spread * len(owners) else node))
-    return out
+    members = list(zip(logits, node_of, strict=True))
+    inside = [[z for z, n in members if root(n) == root(node)] for node in range(len(parents))]
+    return [max(values) if values else empty for values in inside]
 
 
 @settings(max_examples=150, deadline=None)
-@given(
-    data=st.data(), nodes=st.integers(1, 9), count=st.integers(0, 20), suspect=st.sampled_from([-1.5, 0.0, 1.0]),
-    spread=st.sampled_from([0.0, 0.01, 0.25, 0.5, 1.0]),
-)  # fmt: skip
-def test_against_a_plain_walk(data: st.DataObject, nodes: int, count: int, suspect: float, spread: float) -> None:
-    """Forests of any shape, nodes in any order, members on any node; ``spread`` 0 stands for the maximum of trees."""
+@given(data=st.data(), nodes=st.integers(1, 9), count=st.integers(0, 20))
+def test_against_a_plain_walk(data: st.DataObject, nodes: int, count: int) -> None:
+    """Forests of any shape, nodes in any order, members on any node."""
     parents = [data.draw(st.integers(0, node)) for node in range(nodes)]
     names = data.draw(st.permutations(range(nodes)))
     renamed = [0] * nodes
@@ -69,20 +55,9 @@ def test_against_a_plain_walk(data: st.DataObject, nodes: int, count: int, suspe
     node_of = data.draw(st.lists(st.integers(0, nodes - 1), min_size=count, max_size=count))
     values = st.integers(-4, 4).map(float) | st.floats(-1e4, 1e4, width=32)
     logits = data.draw(st.lists(values, min_size=count, max_size=count))
-    hierarchy, part = forest(renamed, node_of), HierarchicalMax()
-    if spread > 0:
-        part = SelectiveLeaf(SelectiveLeaf.Config(suspect=suspect, spread=spread))
-    got = part.propagate(torch.tensor(logits), hierarchy)
-    assert got.tolist() == walked(logits, hierarchy, suspect, spread, -50.0)
-
-
-def test_a_still_leaf_beside_a_moving_one_stays_closed() -> None:
-    """Two regions of four leaves: in the first one leaf moves, in the second three do."""
-    hierarchy = forest([0, 1, 0, 0, 0, 0, 1, 1, 1, 1], [2, 3, 4, 5, 6, 7, 8, 9])
-    z = torch.tensor([5.0, -3.0, -3.0, -3.0, 4.0, 4.0, 4.0, -3.0])
-    got = SelectiveLeaf().propagate(z, hierarchy)
-    assert got.tolist() == [5.0, 4.0, 5.0, -3.0, -3.0, -3.0, 4.0, 4.0, 4.0, 4.0]
-    assert HierarchicalMax().propagate(z, hierarchy).tolist() == [5.0, 4.0, 5.0, 5.0, 5.0, 5.0, 4.0, 4.0, 4.0, 4.0]
+    hierarchy = forest(renamed, node_of)
+    got = HierarchicalMax().propagate(torch.tensor(logits), hierarchy)
+    assert got.tolist() == walked(logits, hierarchy, -50.0)
 
 
 def test_the_gradient_goes_to_the_maximum_and_ties_share_it() -> None:
@@ -128,9 +103,6 @@ REFUSED: dict[str, Callable[[], object]] = {
     r"open_probability: expected shape \[4\]": lambda: ExpectedSparsity().penalty(OPENED[:3], MOVED, NODES, 12),
     "expected at least the 12 active rows, got 11": lambda: ExpectedSparsity().penalty(OPENED, MOVED, NODES, 11),
     r"logits: expected shape \[3\], got \[2\]": lambda: HierarchicalMax().propagate(torch.zeros(2), FLAT),
-    "level: expected one more": lambda: SelectiveLeaf().propagate(
-        torch.tensor([3.0]), Hierarchy(torch.tensor([1]), torch.tensor([0, 0]), torch.tensor([0, 0]))
-    ),
 }
 
 
@@ -140,11 +112,10 @@ def test_refusals(message: str) -> None:
         REFUSED[message]()
 
 
-@pytest.mark.parametrize("part", [HierarchicalMax(), SelectiveLeaf()], ids=repr)
 @pytest.mark.parametrize("length", [2, 3, 5, 8])
-def test_circles_are_refused(part: Propagation, length: int) -> None:
+def test_circles_are_refused(length: int) -> None:
     with pytest.raises(ShapeError, match=f"cycle among {length} nodes"):
-        part.propagate(torch.tensor([0.0]), circle(length))
+        HierarchicalMax().propagate(torch.tensor([0.0]), circle(length))
 
 
 def test_a_price_below_zero_is_refused() -> None:

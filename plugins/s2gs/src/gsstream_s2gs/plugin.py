@@ -19,27 +19,9 @@ COMPONENTS = [
     ),
     ComponentSpec(
         kind="confidence",
-        name="noise-normalised",
-        target="gsstream_s2gs.noise_normalised:NoiseNormalised",
-        summary="change in units of what each camera's noise alone would do",
-    ),
-    ComponentSpec(
-        kind="confidence",
-        name="error-aware",
-        target="gsstream_s2gs.error_aware:ErrorAware",
-        summary="change, or persistent reducible error within a budget",
-    ),
-    ComponentSpec(
-        kind="confidence",
         name="uniform-random",
         target="gsstream_s2gs.uniform_random:UniformRandom",
         summary="confidence by lot (ablation)",
-    ),
-    ComponentSpec(
-        kind="propagation",
-        name="selective-leaf",
-        target="gsstream_s2gs.selective_leaf:SelectiveLeaf",
-        summary="one decision per region while it acts as one, else one per leaf",
     ),
     ComponentSpec(
         kind="propagation",
@@ -81,7 +63,7 @@ METHODS = [
 
 @hookimpl
 def gsstream_components() -> list[ComponentSpec]:
-    """Declare the parts of S2GS, and variants to ablate and to extend it."""
+    """Declare the parts of S2GS, and a variant to ablate it."""
     return list(COMPONENTS)
 
 

@@ -49,6 +49,8 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("psnr", "PSNR, dB", ".2f", True, lambda s, _, __: s.psnr),
     Quantity("psnr_moving", "moving, dB", ".2f", True, lambda s, _, __: s.psnr_moving),
     Quantity("psnr_changed", "changed, dB", ".2f", True, lambda s, _, __: s.psnr_changed),
+    Quantity("psnr_seen", "seen, dB", ".2f", True, _per_view("psnr_seen")),
+    Quantity("psnr_changed_seen", "changed and seen, dB", ".2f", True, _per_view("psnr_changed_seen")),
     Quantity("psnr_slope", "dB/100", "+.2f", True, lambda s, _, __: s.psnr_slope),
     Quantity("ssim", "SSIM", ".4f", True, lambda s, _, __: s.ssim),
     Quantity("ms_ssim", "MS-SSIM", ".4f", True, _per_view("ms_ssim")),

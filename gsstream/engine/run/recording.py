@@ -43,7 +43,10 @@ def reopen_recording(uri: str, recipe: Mapping[str, Any], catalog: Catalog) -> F
         data = DataOptions.model_validate_json(json.dumps(recipe.get("data", {})))
     except ValidationError as error:
         key = ".".join(map(str, error.errors()[0]["loc"]))
-        raise RecipeError(f"the stream's recipe: data.{key}: {error.errors()[0]['msg']}; upgrade gsstream") from error
+        raise RecipeError(
+            f"the stream's recipe: data.{key}: {error.errors()[0]['msg']}; another version of gsstream wrote "
+            "the stream: open its recording with that one"
+        ) from error
     return _open(uri, float(recipe.get("scale", 1.0)), data, catalog)
 
 

@@ -44,8 +44,8 @@ def reopen_recording(uri: str, recipe: Mapping[str, Any], catalog: Catalog) -> F
     except ValidationError as error:
         key = ".".join(map(str, error.errors()[0]["loc"]))
         raise RecipeError(
-            f"the stream's recipe: data.{key}: {error.errors()[0]['msg']}; another version of gsstream wrote "
-            "the stream: open its recording with that one"
+            f"the stream's recipe: data.{key}: {error.errors()[0]['msg']}; the stream is of another "
+            "version of gsstream: open its recording with that one"
         ) from error
     return _open(uri, float(recipe.get("scale", 1.0)), data, catalog)
 

@@ -13,12 +13,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from cpu_scenes import BACKGROUND, GRADIENT_TOLERANCE, HEIGHT, WIDTH, camera, random_splats, reference, relative_error
 from gsstream_cpu_render import _native
-from gsstream_cpu_render.adam import adam_rows
+from gsstream_cpu_render.adam_step import step_table
 from gsstream_cpu_render.arrays import SplatArrays
 from gsstream_cpu_render.loss import photometric_loss
 from gsstream_cpu_render.rasterizer import NumpyRasterizer
+
+from gsstream.api import AdamState
 
 _spec = importlib.util.spec_from_file_location("cross_build", Path(__file__).parent / "cross" / "build.py")
 assert _spec is not None
@@ -125,13 +128,13 @@ def test_against_the_weakest_set_of_this_machine(emulated: dict[str, np.ndarray]
     np.testing.assert_allclose(emulated["loss"], [loss.l1, loss.dssim], rtol=1e-5)
     assert loss.gradient is not None
     assert relative_error(emulated["loss gradient"].reshape(image.shape), loss.gradient) < 1e-4
-    means, first, second = SPLATS.means.copy(), np.zeros_like(SPLATS.means), np.zeros_like(SPLATS.means)
-    steps = np.zeros(len(means), np.int32)
+    means = torch.from_numpy(SPLATS.means.copy())
+    state, gradient = AdamState.start(means), torch.from_numpy(emulated["means"].reshape(means.shape).copy())
     for _ in range(3):
-        adam_rows(means, emulated["means"].reshape(means.shape).copy(), first, second, steps, lr=0.01)
+        step_table("means", means, gradient, state, 0.01)
     np.testing.assert_allclose(emulated["adam"], means.ravel(), atol=1e-6)
-    np.testing.assert_allclose(emulated["adam first"], first.ravel(), rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(emulated["adam second"], second.ravel(), rtol=1e-6, atol=1e-20)
+    np.testing.assert_allclose(emulated["adam first"], state.exp_avg.ravel(), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(emulated["adam second"], state.exp_avg_sq.ravel(), rtol=1e-6, atol=1e-20)
 
 
 def test_the_incremental_mode_gives_the_same_bits(emulated: dict[str, np.ndarray]) -> None:

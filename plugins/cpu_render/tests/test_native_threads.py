@@ -88,7 +88,7 @@ def run(code: str, threads: str) -> subprocess.CompletedProcess[str]:
 
 def test_environment_sets_the_default_and_nothing_needs_torch() -> None:
     code = (
-        "import sys, gsstream_cpu_render.loss, gsstream_cpu_render.adam, gsstream_cpu_render.threads as t;"
+        "import sys, gsstream_cpu_render.loss, gsstream_cpu_render.threads as t;"
         "print(t.num_threads(), t._native.pool_exercise(100, 1), 'torch' in sys.modules)"
     )
     result = run(code, "5")

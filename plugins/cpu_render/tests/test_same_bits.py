@@ -13,18 +13,17 @@ import numpy as np
 import pytest
 import torch
 from cpu_scenes import BACKGROUND, random_splats, rasterizer, upstream
-from gsstream_cpu_render.adam import adam_rows
 from gsstream_cpu_render.adam_part import CpuAdam
+from gsstream_cpu_render.adam_step import step_table
 from gsstream_cpu_render.loss import PreparedImage, photometric_loss, tile_shape
 from gsstream_cpu_render.renderer import CpuRenderer
 from gsstream_cpu_render.threads import set_num_threads
 from test_cpu_fit import VIEW, comparison, values
 from test_cpu_pass import CASES, captured, solved
 from test_cpu_renderer import rig, scene
-from test_native_adam import fresh
 from test_native_loss import near_pair
 
-from gsstream.api import Gaussians, WrtScene
+from gsstream.api import AdamState, Gaussians, WrtScene
 from gsstream.testing.optimiser.checks import _residual_case
 
 
@@ -68,11 +67,12 @@ def iterations_of_a_residual() -> list[Any]:
 
 def adam() -> list[Any]:
     rng = np.random.default_rng(6)
-    mine = fresh(rng.standard_normal((30_000, 3)).astype(np.float32))
+    value = torch.from_numpy(rng.standard_normal((30_000, 3)).astype(np.float32))
+    state = AdamState.start(value)
+    state.steps.copy_(torch.from_numpy(rng.integers(0, 9, 30_000).astype(np.int32)))
     for _ in range(3):
-        grad, rows = rng.standard_normal((30_000, 3)).astype(np.float32), rng.random(30_000) < 0.5
-        adam_rows(grad=grad, rows=rows, lr=0.01, **mine)
-    return [mine["param"], mine["step"]]
+        step_table("means", value, torch.from_numpy(rng.standard_normal((30_000, 3)).astype(np.float32)), state, 0.01)
+    return [value.numpy(), state.steps.numpy()]
 
 
 def loss() -> list[Any]:

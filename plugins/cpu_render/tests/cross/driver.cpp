@@ -110,7 +110,7 @@ void loss(Output& out, const std::vector<float>& image, const std::vector<float>
 void adam(Output& out, std::vector<float> param, const std::vector<float>& gradient, std::size_t columns) {
   std::vector<float> first(param.size()), second(param.size());
   AdamJob job{};
-  job.rows = job.count = param.size() / columns, job.columns = columns;
+  job.rows = param.size() / columns, job.columns = columns;
   job.param = param.data(), job.exp_avg = first.data(), job.exp_avg_sq = second.data(), job.grad = gradient.data();
   job.lr = 0.01, job.beta1 = 0.9, job.beta2 = 0.999, job.eps = 1e-15;
   std::vector<int32_t> steps(job.rows);

@@ -14,7 +14,7 @@ std::size_t rows_per_chunk(const AdamJob& job) { return std::max<std::size_t>(64
 
 void adam_run(const AdamJob& job) {
   const AdamKernels& kernels = adam_kernels();
-  parallel_for(job.count, rows_per_chunk(job),
+  parallel_for(job.rows, rows_per_chunk(job),
                [&](std::size_t begin, std::size_t end) { kernels.update(job, begin, end); });
 }
 
@@ -27,18 +27,9 @@ int64_t adam_first_bad(const AdamJob& job) {
     while ((seen < 0 || static_cast<int64_t>(index) < seen) && !worst.compare_exchange_weak(seen, static_cast<int64_t>(index))) {
     }
   };
-  parallel_for(job.count, rows_per_chunk(job), [&](std::size_t begin, std::size_t end) {
-    if (!job.mask && (job.compact || !job.ids)) {
-      const std::size_t count = (end - begin) * d, found = kernels.first_bad(job.grad + begin * d, count);
-      if (found < count) report(begin * d + found);
-      return;
-    }
-    for (std::size_t i = begin; i < end; ++i) {
-      const std::size_t row = job.ids ? static_cast<std::size_t>(job.ids[i]) : i, at = (job.compact ? i : row) * d;
-      if (job.mask && !job.mask[row]) continue;
-      const std::size_t found = kernels.first_bad(job.grad + at, d);
-      if (found < d) report(at + found);
-    }
+  parallel_for(job.rows, rows_per_chunk(job), [&](std::size_t begin, std::size_t end) {
+    const std::size_t count = (end - begin) * d, found = kernels.first_bad(job.grad + begin * d, count);
+    if (found < count) report(begin * d + found);
   });
   return worst.load();
 }

@@ -13,19 +13,15 @@ struct AdamJob {
   float* param;
   float* exp_avg;
   float* exp_avg_sq;
-  const float* grad;        // [rows, columns], or [count, columns] when compact
-  const int64_t* ids;       // [count] rows to touch, strictly increasing, or null: all
-  bool compact;             // grad has one row per id
-  std::size_t count;        // rows to visit
-  const uint8_t* mask;      // [rows], rows with 0 are left alone; or null
-  int32_t* step;            // [rows] per-row step counts, incremented for touched rows
+  const float* grad;        // [rows, columns]
+  int32_t* step;            // [rows] step counts, incremented
   double lr, beta1, beta2, eps;
   const float* lr_columns;  // [columns] or null
   const float* lr_rows;     // [rows] or null
 };
 
 struct AdamKernels {
-  // Visits ids[begin..end), or rows begin..end without ids.
+  // Visits rows begin..end.
   void (*update)(const AdamJob&, std::size_t begin, std::size_t end);
   // Index of the first non-finite value in [0, count), or count.
   std::size_t (*first_bad)(const float* values, std::size_t count);
@@ -34,7 +30,7 @@ GSS_KERNEL_TABLE(AdamKernels, adam_kernels)
 
 // Updates in place; deterministic for any thread count (rows are independent).
 void adam_run(const AdamJob& job);
-// Flat index of the first non-finite gradient value among the rows the job visits, or -1.
+// Flat index of the first non-finite gradient value, or -1.
 int64_t adam_first_bad(const AdamJob& job);
 
 }  // namespace gsstream_cpu

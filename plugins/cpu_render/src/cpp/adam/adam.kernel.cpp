@@ -82,29 +82,6 @@ GSS_INLINE void set_step(Factors& f, const Correction& c, double lr) {
   f.root2 = broadcast(static_cast<float>(c.root2));
 }
 
-GSS_INLINE std::size_t row_of(const AdamJob& job, std::size_t i) {
-  return job.ids ? static_cast<std::size_t>(job.ids[i]) : i;
-}
-
-GSS_INLINE const float* grad_of(const AdamJob& job, std::size_t i) {
-  return job.grad + (job.compact ? i : row_of(job, i)) * job.columns;
-}
-
-GSS_INLINE bool touched(const AdamJob& job, std::size_t i) {
-  return !(job.mask && !job.mask[row_of(job, i)]);
-}
-
-// Rows far apart in memory are asked for a few rows ahead: their latency, not the arithmetic, is the cost.
-GSS_INLINE void fetch_ahead(const AdamJob& job, std::size_t i, std::size_t end) {
-  constexpr std::size_t ahead = 12;
-  if (!job.ids || i + ahead >= end) return;
-  const std::size_t at = row_of(job, i + ahead) * job.columns, last = at + job.columns - 1;
-  for (const float* array : {job.param, job.exp_avg, job.exp_avg_sq}) {
-    __builtin_prefetch(array + at, 1);
-    __builtin_prefetch(array + last, 1);
-  }
-}
-
 GSS_INLINE bool alike(const AdamJob& job, std::size_t a, std::size_t b) {
   return job.step[a] == job.step[b] && (!job.lr_rows || job.lr_rows[a] == job.lr_rows[b]);
 }
@@ -119,24 +96,18 @@ void update(const AdamJob& job, std::size_t begin, std::size_t end) {
   Correction correction;
   const std::size_t d = job.columns;
   const double common = job.lr_columns ? 1.0 : job.lr;
-  for (std::size_t i = begin; i < end;) {
-    fetch_ahead(job, i, end);
-    if (!touched(job, i)) {
-      ++i;
-      continue;
-    }
-    const std::size_t row = row_of(job, i);
-    // Neighbours in memory that share count and rate form one long row, so that narrow rows fill the vectors.
+  for (std::size_t row = begin; row < end;) {
+    // Neighbours that share count and rate form one long row, so that narrow rows fill the vectors.
     std::size_t run = 1;
     if (!job.lr_columns)
-      while (i + run < end && row_of(job, i + run) == row + run && alike(job, row, row + run) && touched(job, i + run)) ++run;
+      while (row + run < end && alike(job, row, row + run)) ++run;
     const int64_t step = static_cast<int64_t>(job.step[row]) + 1;
     for (std::size_t k = 0; k < run; ++k) job.step[row + k] = static_cast<int32_t>(step);
     correction.set(job, step);
     set_step(f, correction, job.lr_rows ? static_cast<double>(job.lr_rows[row]) : common);
     const std::size_t at = row * d;
-    update_row(job.param + at, grad_of(job, i), job.exp_avg + at, job.exp_avg_sq + at, run * d, f, job.lr_columns);
-    i += run;
+    update_row(job.param + at, job.grad + at, job.exp_avg + at, job.exp_avg_sq + at, run * d, f, job.lr_columns);
+    row += run;
   }
 }
 

@@ -13,7 +13,6 @@ namespace gsstream_cpu {
 namespace {
 
 using StepArray = nb::ndarray<int32_t, nb::c_contig, nb::device::cpu>;
-using IdArray = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
 
 // The Python side has checked everything with messages for people; these checks only keep memory safe.
 void require(bool good, const char* what) {
@@ -30,43 +29,24 @@ void require_vector(const std::optional<Array>& array, std::size_t size, const c
   require(!array || (array->ndim() == 1 && array->shape(0) == size), what);
 }
 
-void require_ids(const AdamJob& job) {
-  for (std::size_t i = 0; i < job.count; ++i) {
-    require(job.ids[i] >= 0 && static_cast<std::size_t>(job.ids[i]) < job.rows, "row ids must lie inside the parameter");
-    require(i == 0 || job.ids[i] > job.ids[i - 1], "row ids must increase strictly");
-  }
-}
-
 int64_t update(FloatArray param, ConstFloatArray grad, FloatArray exp_avg, FloatArray exp_avg_sq, StepArray step,
-               std::optional<IdArray> ids, std::optional<ByteArray> mask, double lr,
-               std::optional<ConstFloatArray> lr_columns, std::optional<ConstFloatArray> lr_rows, double beta1,
-               double beta2, double eps, bool check_finite) {
+               double lr, std::optional<ConstFloatArray> lr_columns, std::optional<ConstFloatArray> lr_rows, double beta1,
+               double beta2, double eps) {
   require(param.ndim() == 2, "param must be [N, d]");
   AdamJob job{};
   job.rows = param.shape(0);
   job.columns = param.shape(1);
-  job.count = job.rows;
   require_matrix(exp_avg, job.rows, job.columns, "exp_avg must have the parameter's shape");
   require_matrix(exp_avg_sq, job.rows, job.columns, "exp_avg_sq must have the parameter's shape");
-  require(grad.ndim() == 2 && grad.shape(1) == job.columns, "grad must be [N, d] or [ids, d]");
+  require_matrix(grad, job.rows, job.columns, "grad must have the parameter's shape");
   require(step.ndim() == 1 && step.shape(0) == job.rows, "step must be [N]");
-  require_vector(mask, job.rows, "mask must be [N]");
   require_vector(lr_columns, job.columns, "per-column lr must be [d]");
   require_vector(lr_rows, job.rows, "per-row lr must be [N]");
-  require(!(lr_columns && lr_rows) && !(ids && mask), "give one kind of rates and one kind of row choice");
-  if (ids) {
-    require(ids->ndim() == 1, "ids must be one-dimensional");
-    job.ids = ids->data();
-    job.count = ids->shape(0);
-    job.compact = grad.shape(0) == job.count;
-    require_ids(job);
-  }
-  require(grad.shape(0) == (job.compact ? job.count : job.rows), "grad must be [N, d] or [ids, d]");
+  require(!(lr_columns && lr_rows), "give one kind of rates");
   job.param = param.data();
   job.exp_avg = exp_avg.data();
   job.exp_avg_sq = exp_avg_sq.data();
   job.grad = grad.data();
-  job.mask = mask ? mask->data() : nullptr;
   job.step = step.data();
   job.lr = lr;
   job.lr_columns = lr_columns ? lr_columns->data() : nullptr;
@@ -75,7 +55,7 @@ int64_t update(FloatArray param, ConstFloatArray grad, FloatArray exp_avg, Float
   job.beta2 = beta2;
   job.eps = eps;
   const nb::gil_scoped_release released;
-  const int64_t bad = check_finite ? adam_first_bad(job) : -1;
+  const int64_t bad = adam_first_bad(job);
   if (bad < 0) adam_run(job);
   return bad;
 }
@@ -85,9 +65,8 @@ int64_t update(FloatArray param, ConstFloatArray grad, FloatArray exp_avg, Float
 void bind_adam(nb::module_& module) {
   module.def("adam_update", &update, nb::arg("param").noconvert(), nb::arg("grad").noconvert(),
              nb::arg("exp_avg").noconvert(), nb::arg("exp_avg_sq").noconvert(), nb::arg("step").noconvert(),
-             nb::arg("ids").noconvert().none(), nb::arg("mask").noconvert().none(), nb::arg("lr"),
-             nb::arg("lr_columns").noconvert().none(), nb::arg("lr_rows").noconvert().none(), nb::arg("beta1"),
-             nb::arg("beta2"), nb::arg("eps"), nb::arg("check_finite"),
+             nb::arg("lr"), nb::arg("lr_columns").noconvert().none(), nb::arg("lr_rows").noconvert().none(),
+             nb::arg("beta1"), nb::arg("beta2"), nb::arg("eps"),
              "Adam in place. Returns -1, or the flat index of a gradient value that is not finite or beyond 1e18 (then nothing "
              "was changed).");
 }

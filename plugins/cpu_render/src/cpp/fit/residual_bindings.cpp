@@ -123,7 +123,7 @@ AdamJob adam_of(const Trained& trained, const std::tuple<double, double, double>
               steps.size() == values.shape(0),
           "Adam's moments must have the shape of their table");
   AdamJob job{};
-  job.rows = job.count = values.shape(0);
+  job.rows = values.shape(0);
   job.columns = values.shape(1);
   job.param = values.data();
   job.exp_avg = first.data();

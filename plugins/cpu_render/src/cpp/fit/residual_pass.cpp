@@ -135,11 +135,11 @@ class Run {
     AdamJob logits = pass_.logits, latents = latents_, matrix = matrix_;
     logits.grad = s_.by_node.data();
     for (const AdamJob* job : {&logits, &latents, &matrix})
-      if (job->count && job->columns && adam_first_bad(*job) >= 0) return false;
+      if (job->rows && job->columns && adam_first_bad(*job) >= 0) return false;
     latents.lr_columns = scaled(pass_.latents.lr_columns, pass_.latents.columns, lr_factor, s_.latent_rates);
     matrix.lr_rows = scaled(pass_.matrix.lr_rows, pass_.matrix.rows, lr_factor, s_.matrix_rates);
     for (const AdamJob* job : {&logits, &latents, &matrix})
-      if (job->count && job->columns) adam_run(*job);
+      if (job->rows && job->columns) adam_run(*job);
     const float bound = pass_.rule.bound;
     for (std::size_t m = 0; m < pass_.nodes; m++) logits.param[m] = std::fmin(std::fmax(logits.param[m], -bound), bound);
     return true;

@@ -6,11 +6,12 @@
 
 The first runs the plans of ``configs/sweeps/results`` one after the other (or goes on with them), takes their numbers
 and fills in the pages. The second takes the numbers of one sweep that ran elsewhere: one run a line, in
-``docs/results/data/NAME.jsonl``, where rows that the sweep does not hold stay as they are. The third fills in every
-table of a page between two comments, of all rows of some files or of those with some names only:
+the file ``NAME.jsonl`` of ``docs/results/data``; rows that the sweep does not hold stay as they are. The third fills in
+every table of a page between two comments: of rows of files, of those with some names, or of a table of the paper:
 
     <!-- rows of protocol, protocol-peers: psnr_first psnr kb -->
     <!-- rows of components, only 1-dense 5-hfp: psnr kb -->
+    <!-- rows of paper-components: row psnr kb -->
     <!-- end of rows -->
 
 and every number within a sentence: a quantity of a run, or its difference or ratio to the same of another run:
@@ -34,6 +35,7 @@ from pathlib import Path
 from typing import Any
 
 from gsstream_lab.report.groups import Run, read_sweep_data
+from gsstream_lab.report.paper import paper_table
 from gsstream_lab.report.quantities import BY_KEY, cell, spread
 
 from gsstream.core.errors import InputError
@@ -50,6 +52,9 @@ NUMBER = re.compile(
     r"<!-- (?P<file>[\w-]+): (?P<name>\S+) (?P<key>\w+)( (?P<sign>[-/]) (?P<other>\S+))? -->"
     r"(?P<value>[^<]*)<!-- end -->"
 )
+
+#: Begins the names of the tables that the paper prints, which the lab has.
+PRINTED = "paper-"
 
 Row = dict[str, Any]
 
@@ -84,7 +89,7 @@ def _which(row: Row) -> tuple[Any, ...]:
 
 def merged(before: Sequence[Row], now: Sequence[Row]) -> list[Row]:
     """Return the rows of both, in their order; a row that was taken before and is the same run keeps its commit."""
-    known = {_which(row): row for row in before}
+    known = {_which(row): row for row in before if "recipe" in row}  # the others were written by hand
     for row in now:
         old = known.get(_which(row))
         same = old is not None and old["date"] == row["date"]
@@ -93,7 +98,9 @@ def merged(before: Sequence[Row], now: Sequence[Row]) -> list[Row]:
 
 
 def read_rows(name: str, folder: Path) -> list[Row]:
-    """Return the rows of a data file. Raises InputError when it is not there."""
+    """Return the rows of a data file, or of a table that the paper of S2GS prints. Raises InputError for others."""
+    if name.startswith(PRINTED):
+        return [{"row": row, **values} for row, values in paper_table(name.removeprefix(PRINTED)).rows.items()]
     path = folder / "data" / f"{name}.jsonl"
     if not path.is_file():
         raise InputError(f"{path}: found no file; 'python -m tools.results take {name} SWEEP' writes its rows")
@@ -108,13 +115,14 @@ def title_of(key: str) -> str:
 
 
 def entry(key: str, values: Sequence[Any]) -> str:
-    """Return a cell of a table: mean and standard deviation over seeds; texts and counts as they stand."""
+    """Return a cell of a table: mean and standard deviation over seeds; other facts as they stand."""
     if key in BY_KEY:
         return str(cell(key, statistics.fmean(values), spread(values)))
-    if len(set(map(str, values))) == 1 and not isinstance(values[0], float):
-        return str(values[0])
-    mean = statistics.fmean(values)
-    return "-" if math.isnan(mean) else f"{mean:.0f}" if abs(mean) >= 10 else f"{mean:.3g}"
+    if key.startswith("ms_"):
+        mean = statistics.fmean(values)
+        return "-" if math.isnan(mean) else f"{mean:.0f}"
+    texts = dict.fromkeys("-" if isinstance(value, float) and math.isnan(value) else str(value) for value in values)
+    return ", ".join(texts)
 
 
 def table_of(rows: Sequence[Row], keys: Sequence[str]) -> str:
@@ -139,19 +147,24 @@ def table_of(rows: Sequence[Row], keys: Sequence[str]) -> str:
 def number_of(found: re.Match[str], rows: Sequence[Row]) -> str:
     """Return what stands in a sentence: a mean over seeds, or the difference or ratio of two. Raises InputError."""
 
-    def mean_of(name: str) -> float:
-        scene, _, run = name.rpartition("/")
-        values = [row.get(found["key"]) for row in rows if row["name"] == run and scene in ("", row["scene"])]
-        if not values or None in values:
-            raise InputError(f"{found[0]}: there is no such number in {found['file']}.jsonl")
-        return statistics.fmean(value for value in values if value is not None)
+    def by_seed(name: str) -> dict[int, float]:
+        scene, _, run = name.replace("~", " ").rpartition("/")
+        some = [row for row in rows if row["name"] == run and scene in ("", row["scene"])]
+        values = {row["seed"]: row[found["key"]] for row in some if found["key"] in row}
+        if not values or len(values) < len(some):
+            where = f"{found['file']}.jsonl, got {len(some)} rows"
+            raise InputError(f"{found[0]}: expected one such number a seed in {where}")
+        return values
 
-    value = mean_of(found["name"])
+    values = by_seed(found["name"])
+    others = by_seed(found["other"] or found["name"])
+    # Two runs are compared on the seeds that both have, because those share a frame 0.
+    value, other = (statistics.fmean(some[seed] for seed in values if seed in others) for some in (values, others))
     if found["sign"] == "/":
-        ratio = value / mean_of(found["other"])
+        ratio = value / other
         return f"{ratio:.0f}" if ratio >= 10 else f"{ratio:.1f}"
     if found["sign"] == "-":
-        return f"{abs(value - mean_of(found['other'])):{BY_KEY[found['key']].form.lstrip('+')}}"
+        return f"{abs(value - other):{BY_KEY[found['key']].form.lstrip('+')}}"
     return cell(found["key"], value) if found["key"] in BY_KEY else f"{value:.3g}"
 
 

@@ -14,9 +14,12 @@ every table of a page between two comments: of rows of files, of those with some
     <!-- rows of paper-components: row psnr kb -->
     <!-- end of rows -->
 
-and every number within a sentence: a quantity of a run, or its difference or ratio to the same of another run:
+and every number within a sentence: a quantity of a run, its difference or ratio to the same of another run, or the
+BD-rate: by how many percent the bytes of a curve differ from another's at equal quality. A curve is the runs whose
+names begin alike:
 
     <!-- protocol-peers: comgs-l kb / s2gs-edge -->2.4<!-- end --> times the bytes
+    <!-- curves: root psnr_changed % open -->-15<!-- end --> %
 
 Rows of one name are runs with different seeds, of which mean and standard deviation are shown. With ``--check`` nothing
 is written, and a page that differs from its data is named (exit code 1).
@@ -34,9 +37,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from gsstream_lab.report.fronts import pareto_front
 from gsstream_lab.report.groups import Run, read_sweep_data
 from gsstream_lab.report.paper import paper_table
 from gsstream_lab.report.quantities import BY_KEY, cell, spread
+from gsstream_lab.report.rate_curves import bd_rate
 
 from gsstream.core.errors import InputError
 from gsstream.evaluation.summary import format_table
@@ -49,7 +54,7 @@ TABLE = re.compile(
     re.S,
 )
 NUMBER = re.compile(
-    r"<!-- (?P<file>[\w-]+): (?P<name>\S+) (?P<key>\w+)( (?P<sign>[-/]) (?P<other>\S+))? -->"
+    r"<!-- (?P<file>[\w-]+): (?P<name>\S+) (?P<key>\w+)( (?P<sign>[-/%]) (?P<other>\S+))? -->"
     r"(?P<value>[^<]*)<!-- end -->"
 )
 
@@ -145,7 +150,10 @@ def table_of(rows: Sequence[Row], keys: Sequence[str]) -> str:
 
 
 def number_of(found: re.Match[str], rows: Sequence[Row]) -> str:
-    """Return what stands in a sentence: a mean over seeds, or the difference or ratio of two. Raises InputError."""
+    """Return what stands in a sentence: a mean over seeds, or how two runs or curves differ. Raises InputError."""
+    if found["sign"] == "%":
+        curves = [_curve(rows, name, found["key"]) for name in (found["other"], found["name"])]
+        return f"{bd_rate(*curves):+.0f}"
 
     def by_seed(name: str) -> dict[int, float]:
         scene, _, run = name.replace("~", " ").rpartition("/")
@@ -166,6 +174,12 @@ def number_of(found: re.Match[str], rows: Sequence[Row]) -> str:
     if found["sign"] == "-":
         return f"{abs(value - other):{BY_KEY[found['key']].form.lstrip('+')}}"
     return cell(found["key"], value) if found["key"] in BY_KEY else f"{value:.3g}"
+
+
+def _curve(rows: Sequence[Row], name: str, quality: str) -> list[tuple[float, float]]:
+    """Return (KB a frame, quality) of the runs of a curve by rising bytes, without points that a cheaper one beats."""
+    points = [(row["kb"], row[quality]) for row in rows if row["name"].startswith(f"{name} ")]
+    return [points[i] for i in pareto_front(points)]
 
 
 def filled(text: str, folder: Path) -> str:
@@ -239,9 +253,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.results", description=__doc__.split("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
     all_plans = sorted(path.stem for path in PLANS.glob("*.yaml"))
-    running = commands.add_parser(
-        "run", help="run plans, take their numbers, fill in the pages"
-    )
+    running = commands.add_parser("run", help="run plans, take their numbers, fill in the pages")
     running.add_argument("names", nargs="*", metavar="NAME", help=f"all of {', '.join(all_plans)}, when left out")
     running.add_argument("--data", type=Path, required=True, help="folder of the recordings")
     running.add_argument("--out", type=Path, required=True, help="folder of the sweeps; those there are continued")

@@ -111,6 +111,18 @@ def test_numbers_in_sentences_are_means_differences_and_ratios(tmp_path: Path) -
         filled("<!-- some: nobody psnr --><!-- end -->", tmp_path)
 
 
+def test_a_curve_that_needs_half_of_the_bytes_has_a_bd_rate_of_minus_fifty(tmp_path: Path) -> None:
+    """Points that a cheaper one beats do not count, and runs of another first word are not of the curve."""
+    rows = [
+        {**RUN, "name": f"{name} x={place}", "kb": factor * kb, "psnr": psnr}
+        for name, factor in (("all", 1.0), ("half", 0.5))
+        for place, (kb, psnr) in enumerate([(1.0, 30.0), (2.0, 31.0), (4.0, 32.0), (5.0, 29.0)])
+    ]
+    rows.append({**RUN, "name": "halfway x=1", "kb": 100.0, "psnr": 31.0})
+    found = page_of(tmp_path, rows, "<!-- some: half psnr % all --><!-- end --> %")
+    assert NUMBER.sub(r"\g<value>", found) == "-50 %"
+
+
 def test_rows_taken_twice_keep_the_commit_that_ran_them() -> None:
     ran = {**RUN, "recipe": "r", "date": "monday", "commit": "a"}
     old = [ran, {**ran, "name": "gone"}, {"by": "hand"}]

@@ -10,7 +10,9 @@ import math
 import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from ruamel.yaml import YAML
@@ -72,23 +74,27 @@ class Layer:
 
 def read_file(path: Path, label: str | None = None) -> Layer:
     """Read a YAML file as a layer. Raises RecipeError for what is no YAML, a key given twice, an anchor."""
-    text = _text_of(path)
-    root = _compose(text, str(path))
+    return _layer(_text_of(path), str(path), label)
+
+
+@lru_cache(maxsize=64)  # a sweep resolves the same few files for every one of its cells
+def _layer(text: str, name: str, label: str | None) -> Layer:
+    root = _compose(text, name)
     if root is None:
         return Layer({})
     if not isinstance(root, MappingNode):
-        raise RecipeError(f"{_where(root, str(path))}: a recipe maps keys to values; got a single value or a list")
+        raise RecipeError(f"{_where(root, name)}: a recipe maps keys to values; got a single value or a list")
 
     def origin(node: Node) -> Origin:
-        return Origin(label or f"file {path}:{node.start_mark.line + 1}", _where(node, str(path)))
+        return Origin(label or f"file {name}:{node.start_mark.line + 1}", _where(node, name))
 
     marks: dict[KeyPath, Origin] = {}
     leaves: dict[KeyPath, Leaf] = {}
-    for key, node, value in _walk(root, (), str(path)):
+    for key, node, value in _walk(root, (), name):
         marks[key] = origin(node)
         if not isinstance(value, Section):
             leaves[key] = Leaf(value, marks[key])
-    return Layer(leaves, marks)
+    return Layer(MappingProxyType(leaves), MappingProxyType(marks))
 
 
 def _text_of(path: Path) -> str:

@@ -9,6 +9,7 @@ import torch
 
 from gsstream.core.changes.motion import GroupTransforms
 from gsstream.core.shapes import FloatArray
+from gsstream.parts.motion.bodies import Bodies, form_bodies
 from gsstream.parts.motion.fitting import found_transforms, narrow_to
 from gsstream.parts.render.work import FitContext
 from gsstream.parts.render.wrt import WrtTransforms
@@ -22,6 +23,13 @@ class Damping(NamedTuple):
     max_step: float  # largest change of any of the six numbers in one step, pixels
 
 
+class BodySettings(NamedTuple):
+    """When neighbouring groups are joined to bodies, and how strongly a body holds its groups."""
+
+    most: float  # loss that joining a pair may cost, summed over the values of all images; 0: no bodies
+    hold: float  # curvature that draws a group to where its body takes it, summed likewise, per pixel^2
+
+
 class DampedNewton:
     """Descends along the gradient of one view after another, divided by the summed curvature of the views so far.
 
@@ -33,6 +41,7 @@ class DampedNewton:
         self.values, self._damping = values, damping
         self._total, self._measured, self._seen = values.new_zeros(len(values), 6, 6), 0, 0
         self._identity = torch.eye(6, dtype=values.dtype, device=values.device)
+        self._held: _HeldGroups | None = None
 
     def step(self, grad: torch.Tensor, curvature: torch.Tensor | None = None) -> None:
         """Replace ``values``: one step against the gradient [K, 6] of a view."""
@@ -40,18 +49,85 @@ class DampedNewton:
         if curvature is not None:
             self._total += curvature
             self._measured += 1
+        matrix = self._damped_curvature()
+        if self._held is not None:
+            self.values = self.values - self._held.step(grad, matrix, self._seen, self._damping.max_step)
+            return
+        # The variant that does not look at its result: to look, a GPU is waited for. What is damped has a solution.
+        step = torch.linalg.solve_ex(matrix, grad[..., None]).result[..., 0]
+        self.values = self.values - step * _shortening(step.abs().amax(1, keepdim=True), self._damping.max_step)
+
+    def join_neighbours(self, center: FloatArray, unit: FloatArray, settings: BodySettings) -> None:
+        """Join groups to bodies (:func:`form_bodies`), which hold them in later steps; call it after the first epoch.
+
+        The motions of groups in a body are smoothed. The steps of later views become long again: the groups have moved,
+        so what earlier views said of them was said of another place.
+        """
+        matrix = self._damped_curvature()
+        bodies = form_bodies(center, unit, self.values.cpu().numpy(), matrix.cpu().numpy(), settings.most)
+        there = torch.from_numpy(bodies.values).to(matrix.device)
+        away = matrix @ (self.values - there)[..., None]
+        away = torch.linalg.solve_ex(matrix + settings.hold * self._identity, away).result[..., 0]
+        self.values = there + away
+        self._held = _HeldGroups(bodies, away, settings.hold / self._measured)
+        self._seen = 1
+
+    def _damped_curvature(self) -> torch.Tensor:
+        """[K, 6, 6] of the views so far."""
         matrix = self._total * (self._seen / self._measured)
         mean = matrix.diagonal(dim1=1, dim2=2).sum(1) / 6
         added = self._damping.relative * mean.maximum(mean.mean()) + self._damping.absolute
-        # The variant that does not look at its result: to look, a GPU is waited for. What is damped has a solution.
-        step = torch.linalg.solve_ex(matrix + added[:, None, None] * self._identity, grad[..., None]).result[..., 0]
-        longest = step.abs().amax(1, keepdim=True)
-        self.values = self.values - step * (self._damping.max_step / longest.clamp_min(1e-12)).clamp_max(1.0)
+        return matrix + added[:, None, None] * self._identity
+
+
+class _HeldGroups:
+    """Groups that springs hold to their bodies: spring * |away|^2 / 2 is added to the loss of every view.
+
+    Arguments:
+        bodies: the bodies.
+        away: [K, 6] how far each group is from where its body takes it.
+        spring: curvature per view.
+    """
+
+    def __init__(self, bodies: Bodies, away: torch.Tensor, spring: float) -> None:
+        self._body = torch.from_numpy(bodies.body).to(away.device)
+        self._lever = torch.from_numpy(bodies.lever).to(away.device)
+        self._number, self._away, self._spring = int(bodies.body.max()) + 1, away, spring
+
+    def step(self, grad: torch.Tensor, matrix: torch.Tensor, seen: int, max_step: float) -> torch.Tensor:
+        """Return [K, 6] what is taken from the values, against the gradient [K, 6] of a view.
+
+        Arguments:
+            matrix: [K, 6, 6] curvature of the ``seen`` views so far, this one among them.
+            max_step: no number of a group changes by more; all groups of its body stay behind in proportion.
+        """
+        # The minimum over groups and bodies together: the groups are eliminated first, each by its own 6 x 6 matrix.
+        identity, spring = torch.eye(6, dtype=grad.dtype, device=grad.device), self._spring * seen
+        inverse = torch.linalg.inv_ex(matrix + spring * identity).inverse
+        alone = inverse @ (grad + self._spring * self._away)[..., None]
+        force = self._by_body(self._lever.mT @ (spring * alone - self._spring * self._away[..., None]))
+        stiff = self._by_body(self._lever.mT @ (spring * (identity - spring * inverse)) @ self._lever)
+        along = self._lever @ torch.linalg.solve_ex(stiff, force).result[self._body]
+        step, along = (alone + spring * inverse @ along)[..., 0], along[..., 0]
+        longest = step.new_zeros(self._number).scatter_reduce_(0, self._body, step.abs().amax(1), "amax")
+        shortening = _shortening(longest[self._body][:, None], max_step)
+        self._away = self._away - (step - along) * shortening
+        taken: torch.Tensor = step * shortening
+        return taken
+
+    def _by_body(self, values: torch.Tensor) -> torch.Tensor:
+        """[B, ...] sum over the groups of every body."""
+        return values.new_zeros(self._number, *values.shape[1:]).index_add_(0, self._body, values)
+
+
+def _shortening(longest: torch.Tensor, most: float) -> torch.Tensor:
+    """Factor on steps whose largest number is ``longest``, so that it is at most ``most``."""
+    return (most / longest.clamp_min(1e-12)).clamp_max(1.0)
 
 
 def fit_transforms_newton(
     work: FitContext, start: GroupTransforms[FloatArray], unit: FloatArray, iterations: int,
-    order: np.random.Generator, damping: Damping, tiles: Literal["all", "changed"] = "all",
+    order: np.random.Generator, damping: Damping, settings: BodySettings, tiles: Literal["all", "changed"] = "all",
 ) -> FloatArray:  # fmt: skip
     """Return the translations and rotations [K, 6] of groups that minimise the loss of the images."""
     views, values = len(work.cameras), 3 * work.cameras.height * work.cameras.width
@@ -62,6 +138,8 @@ def fit_transforms_newton(
     for step in range(iterations):
         if step % views == 0:
             sequence = order.permutation(views)
+        if step == views and settings.most:
+            descent.join_neighbours(start.center, unit, settings)
         now, view = descent.values * per_step, int(sequence[step % views])
         transforms = local._replace(translation=now[:, :3], rotation=now[:, 3:])
         found = work.loss_and_grad(view, WrtTransforms(base, transforms, curvature=step < views), tiles)

@@ -15,7 +15,7 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.parts.motion.base import MotionPart
 from gsstream.parts.motion.groups import changed_groups, known_groups
-from gsstream.parts.motion.newton import Damping, fit_transforms_newton
+from gsstream.parts.motion.newton import BodySettings, Damping, fit_transforms_newton
 from gsstream.parts.render.work import FitContext
 
 
@@ -36,8 +36,9 @@ class Rigid(MotionPart):
     """Fits one rigid transform per group, starting from the last frame's, and codes what corrects the prediction.
 
     A few passes over the training cameras move the groups' six numbers each, by damped Gauss-Newton steps after every
-    view; only the Gaussians of groups that lie in what changed are rendered anew. A group that ends within ``least``
-    pixels of where it stood is left alone.
+    view; only the Gaussians of groups that lie in what changed are rendered anew. After the first pass neighbouring
+    groups whose motions agree are joined to bodies, which hold their groups from then on. A group that ends within
+    ``least`` pixels of where it stood is left alone.
     """
 
     class Config(PartConfig):
@@ -55,6 +56,16 @@ class Rigid(MotionPart):
         )
         hold: float = Field(
             default=40.0, gt=0, le=1e6, description="curvature that holds every group back besides, per pixel^2"
+        )
+        body_cost: float = Field(
+            default=0.02,
+            ge=0,
+            le=1e6,
+            description="loss that joining two neighbours to a body may cost after the first pass, summed over all "
+            "values of all images, as a multiple of the square root of their number; 0: no bodies",
+        )
+        body_hold: float = Field(
+            default=500.0, gt=0, le=1e6, description="curvature that draws a group to its body, per pixel^2"
         )
         longest: float = Field(default=0.5, gt=0, le=10, description="longest step, pixels at a width of 320")
         step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
@@ -94,9 +105,11 @@ class Rigid(MotionPart):
         """[K, 6] shift and turn of the groups that explain the images best."""
         config = self.config
         total = work.scaled(config.epochs * len(work.cameras))
-        longest = config.longest * enlargement(work.cameras.width)
-        damping = Damping(config.damping, config.hold, longest)
+        damping = Damping(config.damping, config.hold, config.longest * enlargement(work.cameras.width))
+        # What noise adds to a sum of so many values grows as the root of their number.
+        values = 3 * work.cameras.height * work.cameras.width * len(work.cameras)
+        bodies = BodySettings(config.body_cost * values**0.5, config.body_hold)
         order = rng.numpy("motion", work.index)
         small = not is_large(work.cameras.width) if config.everywhere == "auto" else config.everywhere
         tiles: Literal["all", "changed"] = "all" if small else "changed"
-        return fit_transforms_newton(work, start, units.row, total, order, damping, tiles)
+        return fit_transforms_newton(work, start, units.row, total, order, damping, bodies, tiles)

@@ -17,7 +17,7 @@ from gsstream.engine.step.context import EngineContext
 from gsstream.packet import PlayerState
 from gsstream.parts.motion.fitting import narrow_to
 from gsstream.parts.motion.groups import changed_groups, known_groups, pixel_size
-from gsstream.parts.motion.newton import DampedNewton, Damping, fit_transforms_newton
+from gsstream.parts.motion.newton import BodySettings, DampedNewton, Damping, fit_transforms_newton
 from gsstream.parts.render.transforms import curvature_of
 from gsstream.parts.render.wrt import WrtTransforms
 from gsstream.testing.cases import get_case
@@ -166,8 +166,9 @@ def test_nothing_that_changed_holds_nothing() -> None:
     assert not found.curvature.any()
 
 
+@pytest.mark.parametrize("settings", [BodySettings(0.0, 500.0), BodySettings(200.0, 500.0)])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_body_that_moved_is_found_where_it_went(seed: int) -> None:
+def test_a_body_that_moved_is_found_where_it_went(seed: int, settings: BodySettings) -> None:
     """The pictures are renders of a cloud of which one half moved by a pixel or two and turned by a degree or two."""
     cloud, work, rng = get_case("cloud"), fit_fixture().work, np.random.default_rng(seed)
     cameras, gaussians = cloud.cameras, cloud.gaussians.map(torch.Tensor.numpy)
@@ -189,7 +190,7 @@ def test_a_body_that_moved_is_found_where_it_went(seed: int) -> None:
     arm = float(np.linalg.norm(gaussians.means[rows] - centre, axis=1).mean())
     unit, order = np.array([pixel] * 3 + [pixel / arm] * 3), np.random.default_rng(0)
     start = moves._replace(translation=zeros, rotation=zeros)
-    found = fit_transforms_newton(seen(images), start, unit, 8 * len(cameras), order, Damping(0.1, 1.0, 0.5))
+    found = fit_transforms_newton(seen(images), start, unit, 8 * len(cameras), order, Damping(0.1, 1.0, 0.5), settings)
     wanted = np.concatenate([shift, turn], 1)
     before, now = np.abs(wanted / unit).max(), np.abs((found - wanted) / unit).max()
     assert now < 0.15, f"{now:.2f} of {before:.2f} pixels are left"

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gsstream.core.changes.motion import quat_to_rotmat, rodrigues_to_quat
 from gsstream.core.shapes import FloatArray, IntArray
 
 #: Groups are neighbours when their centres are at most this many cells apart along every axis.
@@ -111,9 +112,9 @@ def _neighbours(center: FloatArray, reach: float) -> IntArray:
 
 
 def _shift_by_turn(turn: FloatArray, arm: FloatArray) -> FloatArray:
-    """[K, 3] how far turns [K, 3], axis * tan(angle / 2), move the ends of arms [K, 3]: (R - I) arm."""
-    across = np.cross(turn, arm)
-    return np.asarray(2 / (1 + (turn * turn).sum(1, keepdims=True)) * (across + np.cross(turn, across)))
+    """[K, 3] how far turns [K, 3], axis * tan(angle / 2), move the ends of arms [K, 3]."""
+    turned = quat_to_rotmat(rodrigues_to_quat(turn)) @ arm[..., None]
+    return np.asarray(turned[..., 0] - arm)
 
 
 def _cross_matrices(v: FloatArray) -> FloatArray:

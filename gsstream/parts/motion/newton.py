@@ -93,6 +93,7 @@ class _HeldGroups:
         self._body = torch.from_numpy(bodies.body).to(away.device)
         self._lever = torch.from_numpy(bodies.lever).to(away.device)
         self._number, self._away, self._spring = int(bodies.body.max()) + 1, away, spring
+        self._identity = torch.eye(6, dtype=away.dtype, device=away.device)
 
     def step(self, grad: torch.Tensor, matrix: torch.Tensor, seen: int, max_step: float) -> torch.Tensor:
         """Return [K, 6] what is taken from the values, against the gradient [K, 6] of a view.
@@ -102,7 +103,7 @@ class _HeldGroups:
             max_step: no number of a group changes by more; all groups of its body stay behind in proportion.
         """
         # The minimum over groups and bodies together: the groups are eliminated first, each by its own 6 x 6 matrix.
-        identity, spring = torch.eye(6, dtype=grad.dtype, device=grad.device), self._spring * seen
+        spring, identity = self._spring * seen, self._identity
         inverse = torch.linalg.inv_ex(matrix + spring * identity).inverse
         alone = inverse @ (grad + self._spring * self._away)[..., None]
         force = self._by_body(self._lever.mT @ (spring * alone - self._spring * self._away[..., None]))

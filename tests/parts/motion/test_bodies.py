@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scipy.linalg import block_diag
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
@@ -32,7 +33,7 @@ def moved_by(center: np.ndarray, vector: np.ndarray, about: np.ndarray, shift: n
     turn = Rotation.from_rotvec(vector)
     there = turn.apply(center - about) + about + shift - center
     angle = np.linalg.norm(vector)
-    tangent = np.tan(angle / 2) / angle * vector if angle else vector
+    tangent = np.tan(angle / 2) / angle * vector
     return np.concatenate([there, np.broadcast_to(tangent, there.shape)], 1) / UNIT
 
 
@@ -120,15 +121,19 @@ def whole_system(
     pick = np.zeros((6 * groups, 6 * number))
     for group, body in enumerate(bodies.body):
         pick[6 * group : 6 * group + 6, 6 * body : 6 * body + 6] = bodies.lever[group]
-    block = np.zeros((6 * groups, 6 * groups))
-    for group in range(groups):
-        block[6 * group : 6 * group + 6, 6 * group : 6 * group + 6] = matrix[group]
     apart = np.concatenate([np.eye(6 * groups), -pick], 1)  # group - body
     system = seen * spring * apart.T @ apart
-    system[: 6 * groups, : 6 * groups] += block
+    system[: 6 * groups, : 6 * groups] += block_diag(*matrix)
     slope = spring * apart.T @ away.ravel()
     slope[: 6 * groups] += grad.ravel()
     return np.asarray(np.linalg.solve(system, -slope)[: 6 * groups].reshape(groups, 6))
+
+
+def with_damping(total: np.ndarray) -> np.ndarray:
+    """[K, 6, 6] curvature with what ``Damping(0.1, 40, ...)`` adds to it."""
+    mean = np.trace(total, axis1=1, axis2=2) / 6
+    added = 0.1 * np.maximum(mean, mean.mean()) + 40.0
+    return np.asarray(total + added[:, None, None] * np.eye(6))
 
 
 @pytest.mark.parametrize("stiffness", [3.0, 500.0, 1e5])
@@ -139,9 +144,8 @@ def test_a_step_of_held_groups_solves_the_whole_system(stiffness: float) -> None
     descent = DampedNewton(torch.from_numpy(values + 0.3 * rng.standard_normal(values.shape)), Damping(0.1, 40.0, 1e9))
     for view in range(views):
         descent.step(torch.zeros_like(descent.values), torch.from_numpy(curvature) * (view + 1))
-    fitted, total = descent.values.numpy(), curvature * 6
-    added = 0.1 * np.maximum(mean := np.trace(total, axis1=1, axis2=2) / 6, mean.mean()) + 40.0
-    damped = total + added[:, None, None] * np.eye(6)
+    fitted, total = descent.values.numpy(), 6 * curvature
+    damped = with_damping(total)
     bodies = form_bodies(center, UNIT, fitted, damped, 100.0)
     descent.join_neighbours(center, UNIT, BodySettings(100.0, stiffness))
     pulled = np.linalg.solve(damped + stiffness * np.eye(6), damped @ (fitted - bodies.values)[..., None])[..., 0]
@@ -150,9 +154,7 @@ def test_a_step_of_held_groups_solves_the_whole_system(stiffness: float) -> None
     away, before = pulled, descent.values.numpy()
     for seen in (2, 3):
         grad = rng.standard_normal(values.shape)
-        added = 0.1 * np.maximum(mean := np.trace(2 * seen * curvature, axis1=1, axis2=2) / 6, mean.mean()) + 40.0
-        matrix = 2 * seen * curvature + added[:, None, None] * np.eye(6)
-        step = whole_system(bodies, away, grad, matrix, stiffness / views, seen)
+        step = whole_system(bodies, away, grad, with_damping(2 * seen * curvature), stiffness / views, seen)
         descent.step(torch.from_numpy(grad))
         np.testing.assert_allclose(descent.values, before + step, atol=1e-7 * max(1.0, np.abs(step).max()))
         before = descent.values.numpy()

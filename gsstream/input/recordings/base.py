@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
@@ -72,6 +72,14 @@ class SingleImages(Protocol):
 
     def image(self, index: int, camera: str) -> FloatArray:
         """Return [H, W, 3] float32 in [0, 1] of one camera, of either split; the same bits as in ``frame``."""
+
+
+@runtime_checkable
+class StoredImages(Protocol):
+    """A source whose files may hold 8 bits: a frame that waits as bytes then never is float32."""
+
+    def stored_image(self, index: int, camera: str) -> Any:
+        """Return what ``image`` does as uint8, of which 255 is 1.0, where that has the same bits; else float32."""
 
 
 @runtime_checkable

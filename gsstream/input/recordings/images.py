@@ -12,6 +12,7 @@ from PIL import Image
 
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
+from gsstream.core.storage import unpacked
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _RGB_COLOR_TYPE = 2
@@ -35,6 +36,13 @@ def read_image(
     path: Path, size: tuple[int, int], target: tuple[int, int], declared: str = "cameras.json declares"
 ) -> FloatArray:
     """Decode an image, average it down, and return [h, w, 3] float32 in [0, 1]. Raises SourceError naming the file."""
+    return unpacked(read_stored(path, size, target, declared))
+
+
+def read_stored(
+    path: Path, size: tuple[int, int], target: tuple[int, int], declared: str = "cameras.json declares"
+) -> Any:
+    """Return what :func:`read_image` does as uint8, of which 255 is 1.0, where that holds it: 8 bits at their size."""
     pixels, full_scale = _decode(path)
     height, width = pixels.shape[:2]
     if (width, height) != size:
@@ -42,6 +50,8 @@ def read_image(
             f"{path}: the image is {width} x {height} pixels, but {declared} {size[0]} x {size[1]}; "
             "correct the declared size (and K with it) or export the frames again"
         )
+    if pixels.dtype == np.uint8 and target == size:
+        return pixels
     return shrink(pixels, target) / np.float32(full_scale)
 
 

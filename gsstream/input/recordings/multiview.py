@@ -6,16 +6,18 @@ import warnings
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.shapes import BoolArray, FloatArray
+from gsstream.core.storage import unpacked
 from gsstream.input.recordings.base import FilesMissing, PointKind, SourceInfo, Split, check_index
 from gsstream.input.recordings.calibration import Calibration, frame_path, is_video, read_calibration
 from gsstream.input.recordings.depth_maps import FOLDER
-from gsstream.input.recordings.images import read_image
+from gsstream.input.recordings.images import read_stored
 from gsstream.input.recordings.sync import RecordingWarning
 
 POINTS_FILE = "points_frame0.npz"
@@ -68,8 +70,12 @@ class MultiviewSource:
 
     def image(self, index: int, camera: str) -> FloatArray:
         """Return one camera's image [H, W, 3]. Raises SourceError like ``frame``."""
+        return unpacked(self.stored_image(index, camera))
+
+    def stored_image(self, index: int, camera: str) -> Any:
+        """Return the same as uint8, of which 255 is 1.0, where that holds it."""
         check_index(self._info, index)
-        return read_image(self._folder / frame_path(self._patterns[camera], index), self._native, self._target)
+        return read_stored(self._folder / frame_path(self._patterns[camera], index), self._native, self._target)
 
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
         """Return points of frame 0 that ship with the recording, or None when it ships none.

@@ -14,7 +14,7 @@ import numpy as np
 from gsstream.core.errors import EndOfRecording, GsstreamError, InputError, SourceError
 from gsstream.core.frame import Frame
 from gsstream.core.storage import packed
-from gsstream.input.recordings.base import FrameSource, LiveSource, SingleImages
+from gsstream.input.recordings.base import FrameSource, LiveSource, SingleImages, StoredImages
 from gsstream.input.recordings.canonical import to_file_coordinates
 
 FramePair = tuple[Frame, Frame]
@@ -103,7 +103,10 @@ def _packed_views(source: FrameSource, index: int) -> Any:
         return None
     views = np.empty((len(cameras), cameras.height, cameras.width, 3), np.uint8)
     for out, name in zip(views, cameras.ids, strict=True):
-        view = packed(single.image(index, name))
+        if isinstance(single, StoredImages):
+            view = packed(single.stored_image(index, name))
+        else:
+            view = packed(single.image(index, name))
         if view.dtype != np.uint8 or view.shape != out.shape:
             return None
         out[...] = view

@@ -11,7 +11,8 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.shapes import check_finite, check_shape
-from gsstream.input.recordings.base import FrameSource, SingleImages, Split
+from gsstream.core.storage import unpacked
+from gsstream.input.recordings.base import FrameSource, SingleImages, Split, StoredImages
 from gsstream.testing.recording import Skip, SourceUnderTest
 from gsstream.testing.registry import check
 
@@ -170,7 +171,7 @@ def check_source_scale(subject: SourceUnderTest) -> None:
 
 @check("source")
 def check_source_single_images(subject: SourceUnderTest) -> None:
-    """One camera's image, where it is offered, has the bits that it has in the frame."""
+    """One camera's image, where it is offered, has the bits that it has in the frame, stored as bytes or not."""
     with subject.open() as source:
         offered: Any = source
         if not isinstance(source, SingleImages):
@@ -180,3 +181,6 @@ def check_source_single_images(subject: SourceUnderTest) -> None:
             for place, camera in enumerate(frame.cameras.ids):
                 single = offered.image(0, camera)
                 assert np.array_equal(single, frame.images[place]), f"camera {camera!r}: not the image of the frame"
+                if isinstance(source, StoredImages):
+                    stored = unpacked(source.stored_image(0, camera))
+                    assert np.array_equal(stored, single), f"camera {camera!r}: another image where it is stored"

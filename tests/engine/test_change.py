@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gsstream.core.frame import Frame
+from gsstream.core.storage import unpacked
 from gsstream.engine.step.active import blocks, change_on_device
 from gsstream.engine.step.active.blocks import (
     BLOCK,
@@ -16,6 +19,7 @@ from gsstream.engine.step.active.blocks import (
     block_means,
     block_sigma,
     changed_blocks,
+    picture_difference,
 )
 from gsstream.engine.step.active.change import Change, detect_changed_tiles
 from gsstream.input.recordings.open import open_source
@@ -56,6 +60,30 @@ def test_noise_of_block_means_is_the_lesser_of_spread_and_roughness(
     assert block_sigma(means) == sigma_by_hand(means)
     expected = (np.abs(means) > 4.0 * sigma_by_hand(means)).any(-1)
     np.testing.assert_array_equal(changed_blocks(difference, 4.0), expected)
+
+
+@given(height=st.integers(1, 40), width=st.integers(1, 40), noise=st.integers(0, 255), seed=st.integers(0, 999))
+def test_blocks_of_bytes_are_those_of_exact_differences(height: int, width: int, noise: int, seed: int) -> None:
+    """Sums of levels stay in range where a picture turns from black to white, and none is rounded."""
+    rng = np.random.default_rng(seed)
+    before = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
+    now = np.clip(before.astype(np.int64) + rng.integers(-noise, noise + 1, before.shape), 0, 255).astype(np.uint8)
+    exact = (now.astype(np.float64) - before) / 255
+    means = block_means(picture_difference(before, now))
+    np.testing.assert_allclose(means, block_means(exact), rtol=0, atol=1e-12)
+    floats = picture_difference(unpacked(before), unpacked(now))
+    np.testing.assert_allclose(means, block_means(floats), rtol=0, atol=1e-6)
+
+
+@given(rows=st.integers(1, 5), columns=st.integers(1, 7), cut=st.integers(0, 15), seed=st.integers(0, 999))
+def test_what_did_not_change_is_zero_and_the_rest_as_it_was(rows: int, columns: int, cut: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    tiles = rng.random((rows, columns)) < rng.random()
+    height, width = 16 * rows - cut, 16 * columns - cut
+    values = rng.normal(size=(height, width, 3)).astype(np.float32)
+    change = Change(torch.from_numpy(tiles)[None], height, width)
+    mask = np.kron(tiles, np.ones((16, 16), bool))[:height, :width, None]
+    np.testing.assert_array_equal(change.only_changed(0, torch.from_numpy(values)).numpy(), np.where(mask, values, 0))
 
 
 THRESHOLD = 6.0

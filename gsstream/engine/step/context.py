@@ -118,7 +118,7 @@ class EngineContext:
         """A gradient by what a camera records, in the tiles that changed, as one by the scene's colours."""
         upstream = image_gradient.float()
         if self._change is not None:
-            upstream = upstream * self._change.pixels(view)
+            upstream = self._change.only_changed(view, upstream)
         if self.photometric.exposure:
             upstream = self.photometric.exposure[view].vjp(upstream)
         return upstream.contiguous()

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from gsstream.core.median import median
 from gsstream.core.shapes import BoolArray, FloatArray
+from gsstream.core.storage import unpacked
 from gsstream.metrics.noise import MAD_TO_SIGMA, median_deviation
 
 #: Differences are averaged over BLOCK x BLOCK pixels first: noise of neighbouring pixels is mostly independent and
@@ -25,8 +28,18 @@ MOST_SIGMA = 4 / 255
 MOST_OF_ROUGHNESS = 1.5
 
 
-def changed_blocks(difference: FloatArray, threshold: float) -> BoolArray:
-    """Return [ceil(H / 4), ceil(W / 4)] bool: blocks whose mean difference exceeds the noise of block means."""
+def picture_difference(before: Any, now: Any) -> Any:
+    """Return [H, W, 3]: float32, or int16 in levels of 8 bits where both images are stored as bytes."""
+    if before.dtype == now.dtype == np.uint8:
+        return np.subtract(now, before, dtype=np.int16)
+    return unpacked(now) - unpacked(before)
+
+
+def changed_blocks(difference: Any, threshold: float) -> BoolArray:
+    """Return [ceil(H / 4), ceil(W / 4)] bool: blocks whose mean difference exceeds the noise of block means.
+
+    ``difference`` is that of :func:`picture_difference`.
+    """
     means = block_means(difference)
     marked = np.abs(means) > threshold * block_sigma(means)
     return np.asarray(marked[..., 0] | marked[..., 1] | marked[..., 2])
@@ -40,22 +53,29 @@ def block_sigma(means: FloatArray) -> float:
     return min(max(_at_most_rough(spread, means), LEAST_SIGMA), MOST_SIGMA)
 
 
-def block_means(picture: FloatArray) -> FloatArray:
-    """Return [ceil(H / 4), ceil(W / 4), 3] means of [H, W, 3]; blocks at the border average the pixels they have."""
+def block_means(picture: Any) -> FloatArray:
+    """Return [ceil(H / 4), ceil(W / 4), 3] means of [H, W, 3]; blocks at the border average the pixels they have.
+
+    Of int16 the sums are exact (they stay below 2^12), and a level is 1 / 255.
+    """
     sums = _sums(_sums(picture).swapaxes(0, 1)).swapaxes(0, 1)
+    if sums.dtype == np.int16:
+        sums = np.divide(sums, 255.0)
     if not any(n % BLOCK for n in picture.shape[:2]):
         return np.asarray(np.multiply(sums, 1 / BLOCK**2, dtype=np.float64))
     sizes = [np.minimum(BLOCK, n - np.arange(0, n, BLOCK)) for n in picture.shape[:2]]
     return np.asarray(sums / np.outer(*sizes)[..., None])
 
 
-def _sums(rows: FloatArray) -> FloatArray:
+def _sums(rows: Any) -> Any:
     """Sums over BLOCK rows each; the last block may have fewer. A fifth of the time of ``np.add.reduceat``."""
     whole = len(rows) // BLOCK * BLOCK
     first, second, third, fourth = (rows[i:whole:BLOCK] for i in range(BLOCK))
     # The order in which reduceat adds, so that streams keep their bits.
     sums = first + (second + third + fourth)
-    return sums if whole == len(rows) else np.concatenate([sums, rows[whole] + rows[whole + 1 :].sum(0, keepdims=True)])
+    if whole == len(rows):
+        return sums
+    return np.concatenate([sums, rows[whole] + rows[whole + 1 :].sum(0, keepdims=True, dtype=rows.dtype)])
 
 
 def _at_most_rough(spread: float, means: FloatArray) -> float:

@@ -183,7 +183,7 @@ class ViewSpaceGradient(ConfidenceEstimator):
         """[H, W, 3] derivative of E_t - E_{t-1} with respect to the render of frame t-1."""
         now, before = context.image(view), context.previous_image(view)
         if self.config.loss == "mse":
-            return 2 * (before - now) / before.numel()
+            return (before - now).mul_(2 / before.numel())
         render = context.previous_render(view)
         pixels = before.shape[0] * before.shape[1]
         return (self._direction(render - now) - self._direction(render - before)) / pixels

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -17,6 +18,8 @@ _RADIUS, _SIGMA, _C1, _C2 = 5, 1.5, 0.01**2, 0.03**2
 #: What stands beyond the border: zeros (3DGS), the mirrored image (kornia, torchmetrics), or nothing: only windows
 #: inside the image count (Wang's own code, scikit-image, pytorch-msssim).
 Border = Literal["zero", "reflect", "valid"]
+#: Rows of a picture that are compared at a time.
+_BAND = 64
 #: Exponents of the scales, finest first (Wang, Simoncelli, Bovik 2003).
 _SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
@@ -27,10 +30,10 @@ def ssim(image: FloatArray, target: FloatArray, border: Border = "zero") -> floa
     Computed in float64. Raises ShapeError when shapes disagree, or are smaller than a window where one must fit.
     """
     check_pair(image, target)
-    # Channel by channel: the maps of all three of a large picture take hundreds of megabytes.
-    channels = [(image[..., [i]], target[..., [i]]) for i in range(3)]
-    products = (np.multiply(*_ssim_maps(x, y, border)) for x, y in channels)
-    return float(np.mean([product.mean() for product in products]))
+    _check_fits(image, border)
+    total = sum(float(band.sum()) for band in _ssim_by_bands(image, target, border))
+    lost = 2 * _RADIUS if border == "valid" else 0
+    return float(total / (3 * (image.shape[0] - lost) * (image.shape[1] - lost)))
 
 
 def ms_ssim(image: FloatArray, target: FloatArray) -> float:
@@ -55,11 +58,30 @@ def ms_ssim(image: FloatArray, target: FloatArray) -> float:
     return float(value.mean())
 
 
-def _ssim_maps(image: FloatArray, target: FloatArray, border: Border) -> tuple[FloatArray, FloatArray]:
-    """The two factors of SSIM, pixel by pixel: (luminance, contrast and structure)."""
+def _ssim_by_bands(image: FloatArray, target: FloatArray, border: Border) -> Iterator[FloatArray]:
+    """SSIM pixel by pixel, some rows of one channel at a time.
+
+    The maps of a whole large picture take hundreds of megabytes; those of a band stay in the processor's cache.
+    """
+    inside = border == "valid"
+    for top in range(0, len(image) - 2 * _RADIUS * inside, _BAND):
+        first = top if inside else max(0, top - _RADIUS)
+        rows = slice(first, top + _BAND + (2 * _RADIUS if inside else _RADIUS))
+        # Windows that reach beyond the band, but not beyond the picture, are cut off again.
+        wanted = slice(top - first, top - first + _BAND)
+        for channel in range(image.shape[2]):
+            luminance, structure = _ssim_maps(image[rows, :, [channel]], target[rows, :, [channel]], border)
+            yield (luminance * structure)[wanted]
+
+
+def _check_fits(image: FloatArray, border: Border) -> None:
     if border != "zero" and min(image.shape[:2]) <= 2 * _RADIUS:
         got = list(image.shape[:2])
         raise ShapeError(f"SSIM with border {border!r}: expected sides above {2 * _RADIUS}, got {got}")
+
+
+def _ssim_maps(image: FloatArray, target: FloatArray, border: Border) -> tuple[FloatArray, FloatArray]:
+    """The two factors of SSIM, pixel by pixel: (luminance, contrast and structure)."""
     x, y = np.asarray(image, np.float64), np.asarray(target, np.float64)
     mean_x, mean_y, square_x, square_y, product = (_window_mean(v, border) for v in (x, y, x * x, y * y, x * y))
     var_x, var_y, cov = square_x - mean_x**2, square_y - mean_y**2, product - mean_x * mean_y

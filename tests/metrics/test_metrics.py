@@ -56,7 +56,7 @@ def test_images_that_do_not_fit_are_refused():
         psnr(a, a, np.ones((3, 3), bool))
 
 
-@pytest.mark.parametrize(("height", "width", "noise"), [(40, 56, 0.1), (13, 200, 0.5), (3, 4, 0.2), (64, 64, 0.001)])
+@pytest.mark.parametrize(("height", "width", "noise"), [(40, 56, 0.1), (13, 200, 0.5), (3, 4, 0.2), (130, 20, 0.1)])
 def test_ssim_equals_kornia_with_zero_padding(height, width, noise):
     a, b = pair(1, height, width, noise)
     tensors = [functional.pad(torch.tensor(x, dtype=torch.float64).permute(2, 0, 1)[None], (5,) * 4) for x in (a, b)]

@@ -38,16 +38,15 @@ class HeldOut:
         if self._first is None:
             self._first = frame
         elif not self._sigma:
-            pairs = zip(self._first.images, frame.images, strict=True)
-            self._sigma = [noise_sigma(a, b) for a, b in pairs]
+            self._sigma = _noise(self._first, frame)
         out: dict[str, Any] = {"psnr": {}, "ssim": {}, "psnr_moving": {}, "psnr_changed": {}}
         for view, name in enumerate(frame.cameras.ids):
             image = self.render(state, frame, view)
-            truth = frame.images[view]
+            truth = frame.image(view)
             out["psnr"][name] = _finite(psnr(image, truth))
             out["ssim"][name] = _finite(ssim(image, truth))
             out["psnr_moving"][name] = self._moving(image, truth, view)
-            out["psnr_changed"][name] = _finite(psnr(image, truth, changed_mask(truth, self._first.images[view])))
+            out["psnr_changed"][name] = _finite(psnr(image, truth, changed_mask(truth, self._first.image(view))))
         return out
 
     def doubt(self, state: MethodState, train: Frame, measured: Mapping[str, float | None]) -> str:
@@ -69,7 +68,7 @@ class HeldOut:
         """Note what a resumed run must know of the frames it does not redo."""
         self._first = first
         if second is not None:
-            self._sigma = [noise_sigma(a, b) for a, b in zip(first.images, second.images, strict=True)]
+            self._sigma = _noise(first, second)
 
     def render(self, state: MethodState, frame: Frame, view: int) -> FloatArray:
         """Return the decoded image [H, W, 3] of a camera, in [0, 1]."""
@@ -81,8 +80,13 @@ class HeldOut:
     def _moving(self, image: FloatArray, truth: FloatArray, view: int) -> float | None:
         if self._first is None or not self._sigma:
             return None
-        mask = moving_mask(truth, self._first.images[view], self._sigma[view])
+        mask = moving_mask(truth, self._first.image(view), self._sigma[view])
         return _finite(psnr(image, truth, mask))
+
+
+def _noise(first: Frame, second: Frame) -> list[float]:
+    """Noise of every camera, image units."""
+    return [noise_sigma(first.image(view), second.image(view)) for view in range(len(first.cameras))]
 
 
 def _finite(value: float) -> float | None:

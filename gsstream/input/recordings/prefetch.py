@@ -27,7 +27,7 @@ class Prefetcher:
 
     An error while reading a frame is raised when its turn comes; iteration then ends, as it does where a growing
     recording does. Use as a context manager, or call ``close``, so that threads end. ``depth`` None: 2, and 1 where the
-    images of one pair take more than ``LARGE_PAIR``. ``pack``: training images wait as bytes where bytes hold them.
+    images of one pair take more than ``LARGE_PAIR``. ``pack``: images wait as bytes where bytes hold them.
     """
 
     def __init__(
@@ -113,16 +113,20 @@ def _packed_views(source: FrameSource, index: int) -> Any:
     return views
 
 
+def _packed_frame(frame: Frame) -> Frame:
+    return replace(frame, images=packed(frame.images))
+
+
 def _read_pair(source: FrameSource, index: int, pack: bool) -> FramePair:
     try:
         views = _packed_views(source, index) if pack else None
         if views is not None:
             # All but the images is that of the test cameras' frame of the same instant.
-            test = source.frame(index, "test")
+            test = _packed_frame(source.frame(index, "test"))
             return replace(test, images=views, cameras=source.info.train), test
-        train = source.frame(index, "train")
-        images = packed(train.images) if pack else train.images
-        pair = replace(train, images=images), source.frame(index, "test")
+        pair = source.frame(index, "train"), source.frame(index, "test")
+        if pack:
+            pair = _packed_frame(pair[0]), _packed_frame(pair[1])
     except GsstreamError:
         raise
     except Exception as error:  # a source may be a plugin's: its failure is reported with its name

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -146,5 +147,24 @@ def test_bytes_are_read_camera_by_camera_and_other_images_whole(shift: float, dt
             assert train.images.dtype == dtype
             assert train.as_float32().images.tobytes() == want.images.tobytes()
             assert (train.index, train.timestamp, train.cameras.ids) == (index, want.timestamp, want.cameras.ids)
-            assert test.images.tobytes() == plain.frame(index, "test").images.tobytes()
+            assert test.as_float32().images.tobytes() == plain.frame(index, "test").images.tobytes()
     assert (source.wholes, source.singles) == (wholes, 9)
+
+
+class Stored(Singly):
+    """The same, of which the images can be read as the bytes that they are."""
+
+    def stored_image(self, index: int, camera: str) -> np.ndarray[Any, Any]:
+        return np.rint(Singly.image(self, index, camera) * 255).astype(np.uint8)
+
+    def image(self, index: int, camera: str) -> FloatArray:
+        raise AssertionError("read as float32, though its bytes are offered")
+
+
+def test_what_is_stored_as_bytes_is_never_float32() -> None:
+    source, plain = Stored(), Singly()
+    with Prefetcher(source, range(3), pack=True) as frames:
+        for index, (train, _) in enumerate(frames):
+            assert train.images.dtype == np.uint8
+            assert train.as_float32().images.tobytes() == plain.frame(index).images.tobytes()
+    assert source.wholes == 0

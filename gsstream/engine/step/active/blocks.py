@@ -14,6 +14,8 @@ from gsstream.metrics.noise import MAD_TO_SIGMA, median_deviation
 #: Differences are averaged over BLOCK x BLOCK pixels first: noise of neighbouring pixels is mostly independent and
 #: averages out (rendered noise is heavy-tailed, so a threshold on single pixels finds it everywhere), motion does not.
 BLOCK = 4
+#: Rows that are subtracted at a time, a multiple of BLOCK.
+_BAND = 64
 #: Lower bound on the estimated noise of a block's mean difference. Compressed video repeats still blocks exactly;
 #: without a floor the change of half a grey level by the encoder would count as motion.
 LEAST_SIGMA = 0.5 / 255
@@ -28,21 +30,29 @@ MOST_SIGMA = 4 / 255
 MOST_OF_ROUGHNESS = 1.5
 
 
-def picture_difference(before: Any, now: Any) -> Any:
-    """Return [H, W, 3]: float32, or int16 in levels of 8 bits where both images are stored as bytes."""
+def changed_blocks(before: Any, now: Any, threshold: float) -> BoolArray:
+    """Return [ceil(H / 4), ceil(W / 4)] bool: blocks whose mean difference exceeds the noise of block means.
+
+    Arguments:
+        before, now: [H, W, 3] float32, or uint8 of which 255 is 1.0.
+        threshold: multiple of the noise.
+    """
+    means = difference_means(before, now)
+    marked = np.abs(means) > threshold * block_sigma(means)
+    return np.asarray(marked[..., 0] | marked[..., 1] | marked[..., 2])
+
+
+def difference_means(before: Any, now: Any) -> FloatArray:
+    """Return the block means of ``now - before``, band by band of rows: a whole difference would leave the cache."""
+    bands = (slice(top, top + _BAND) for top in range(0, len(now), _BAND))
+    return np.concatenate([block_means(_difference(before[band], now[band])) for band in bands])
+
+
+def _difference(before: Any, now: Any) -> Any:
+    """[H, W, 3] float32, or int16 in levels of 8 bits where both images are stored as bytes."""
     if before.dtype == now.dtype == np.uint8:
         return np.subtract(now, before, dtype=np.int16)
     return unpacked(now) - unpacked(before)
-
-
-def changed_blocks(difference: Any, threshold: float) -> BoolArray:
-    """Return [ceil(H / 4), ceil(W / 4)] bool: blocks whose mean difference exceeds the noise of block means.
-
-    ``difference`` is that of :func:`picture_difference`.
-    """
-    means = block_means(difference)
-    marked = np.abs(means) > threshold * block_sigma(means)
-    return np.asarray(marked[..., 0] | marked[..., 1] | marked[..., 2])
 
 
 def block_sigma(means: FloatArray) -> float:

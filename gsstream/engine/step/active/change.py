@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +15,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.picture_size import is_large
 from gsstream.core.processors import processors
 from gsstream.core.shapes import BoolArray, FloatArray, IntArray
-from gsstream.engine.step.active.blocks import BLOCK, changed_blocks, picture_difference
+from gsstream.engine.step.active.blocks import BLOCK, changed_blocks
 from gsstream.parts.render.base import TILE
 
 #: Blocks of a 16 x 16 tile (of 16) that must exceed the threshold.
@@ -111,7 +110,7 @@ def detect_changed_tiles(previous: Frame, frame: Frame, threshold: float) -> Cha
         return None
 
     def of(view: int) -> BoolArray:
-        return _changed(picture_difference(previous.images[view], frame.images[view]), threshold)
+        return _changed(changed_blocks(previous.images[view], frame.images[view], threshold))
 
     cameras, views = frame.cameras, range(len(frame.cameras))
     if is_large(cameras.width):  # in small pictures threads take longer than they save
@@ -122,9 +121,8 @@ def detect_changed_tiles(previous: Frame, frame: Frame, threshold: float) -> Cha
     return Change(torch.from_numpy(np.stack(tiles)), cameras.height, cameras.width)
 
 
-def _changed(difference: Any, threshold: float) -> BoolArray:
-    """[rows, columns] bool of one view."""
-    moved = changed_blocks(difference, threshold)
+def _changed(moved: BoolArray) -> BoolArray:
+    """[rows, columns] bool of one view, of its blocks that changed."""
     count, blocks = count_per_tile(moved, TILE // BLOCK)
     return np.asarray(count >= np.minimum(MIN_BLOCKS, blocks))
 

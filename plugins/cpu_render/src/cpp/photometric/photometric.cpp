@@ -81,9 +81,8 @@ struct Workspace {
     for (float*& map : job.maps) map = nullptr;
     if (!with_maps) return;
     if (maps.bytes() < 3 * map_floats * sizeof(float)) maps_clean = false;
-    maps.require(3 * map_floats);
     // The rim must be zero and is never written; tiles are written or zeroed by every call that reads them.
-    if (!maps_clean) std::memset(maps.data(), 0, 3 * map_floats * sizeof(float));
+    if (!maps_clean) maps.require_zeros(3 * map_floats);
     maps_clean = true;
     for (int m = 0; m < 3; ++m) job.maps[m] = maps.data() + m * map_floats + kReach * map_stride + kPad;
   }

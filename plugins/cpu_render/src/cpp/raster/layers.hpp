@@ -53,8 +53,8 @@ struct LayerSource {
 
 class Layers {
  public:
-  // From now on layers of another scene, whose image has so many tiles. Keeps the memory: frame by frame it would be
-  // asked for again.
+  // From now on layers of another scene, whose image has so many tiles. Keeps the memory of tiles that had layers in the
+  // scene before: frame by frame it would be asked for again.
   void clear(std::size_t tiles);
   // There are no layers until the next clear().
   void drop() { valid_ = false; }

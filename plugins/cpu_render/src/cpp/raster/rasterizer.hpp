@@ -60,7 +60,8 @@ struct PixelTrace {
   std::size_t bytes() const { return transmittance.bytes() + last.bytes(); }
 };
 
-// The moments of a backward, in memory of the calling thread: they are summed up before it returns.
+// The moments of a backward, in memory of the calling thread: they are summed up before it returns. free_scratch lets
+// go of them.
 Buffer<float>& moment_workspace();
 
 // What a pass leaves to its backward, but for the cache.

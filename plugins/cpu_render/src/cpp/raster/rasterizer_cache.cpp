@@ -183,6 +183,7 @@ void Rasterizer::free_scratch() {
   const Claim claim(owner_);
   if (state_ != State::empty) state_ = State::cached;
   own_.release();
+  moment_workspace().release();
   reached_rows_.release();
   reached_gradient_.release();
   reached_count_ = 0;

@@ -35,6 +35,14 @@ class Buffer {
     if (count > capacity_) reallocate(count, keep);
     return data_;
   }
+  // `count` items, all bytes zero. Pages of a large one are zero as the system hands them out, each when it is first
+  // written: what is never written takes no memory.
+  T* require_zeros(std::size_t count) {
+    release();
+    T* data = require(count);
+    if (!is_large(bytes())) std::memset(data, 0, bytes());
+    return data;
+  }
   void release() {
     give_back();
     data_ = nullptr;

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 
 from gsstream.core.frame import Frame
@@ -51,6 +52,17 @@ class HutchinsonSample(NamedTuple):
     error: float
 
 
+def random_signs(like: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    """Return -1 or 1, each as often, for every value of ``like``.
+
+    Eight are drawn at a time: one by one they take as long as a render of a large picture.
+    """
+    drawn = torch.randint(0, 256, (-(-like.numel() // 8),), generator=generator, dtype=torch.uint8)
+    # As bytes, a quarter of what they become, for they may have to cross to a GPU.
+    bits = torch.from_numpy(np.unpackbits(drawn.numpy(), count=like.numel())).to(like.device)
+    return bits.to(like.dtype).mul_(2).sub_(1).reshape(like.shape)
+
+
 def _pop_grad(leaf: torch.Tensor) -> torch.Tensor:
     """The gradient of a leaf, which has none afterwards."""
     gradient, leaf.grad = gradient_of(leaf), None
@@ -69,8 +81,7 @@ def hutchinson_samples(
         seen = image.detach() if exposure is None else exposure[view].apply(image.detach())
         error = views.error(view, seen)
         for number in range(each):
-            # As bytes, an eighth of what they are drawn as, for they may have to cross to a GPU.
-            signs = torch.randint(0, 2, image.shape, generator=generator).to(torch.int8).to(image) * 2 - 1
+            signs = random_signs(image, generator)
             upstream = signs if exposure is None else exposure[view].vjp(signs)
             backward([image], [upstream], retain_graph=number < each - 1)
             yield HutchinsonSample(leaves.map(_pop_grad), error)

@@ -1,13 +1,15 @@
 """Numbers of the results pages: from plans of sweeps to docs/results/data, and from there into the pages.
 
     python -m tools.results run --data DATA --out RUNS [NAME ...]
-    python -m tools.results take NAME SWEEP --commit HASH
+    python -m tools.results take NAME SWEEP --commit HASH [--seen FRAME ...]
     python -m tools.results fill [--check]
 
 The first runs the plans of ``configs/sweeps/results`` one after the other (or goes on with them), takes their numbers
-and fills in the pages. The second takes the numbers of one sweep that ran elsewhere: one run a line, in
-the file ``NAME.jsonl`` of ``docs/results/data``; rows that the sweep does not hold stay as they are. The third fills in
-every table of a page between two comments: of rows of files, of those with some names, or of a table of the paper:
+and fills in the pages. The second takes the numbers of one sweep that ran elsewhere: one run a line, in the file
+``NAME.jsonl`` of ``docs/results/data``; rows that the sweep does not hold stay as they are. With ``--seen`` its streams
+are decoded once more, for PSNR on pixels that training cameras see, too: the means over frames, and of each FRAME what
+changed, as ``frame_8``. The third fills in every table of a page between two comments: of rows of files, of those with
+some names, or of a table of the paper:
 
     <!-- rows of protocol, protocol-peers: psnr_first psnr kb -->
     <!-- rows of components, only 1-dense 5-hfp: psnr kb -->
@@ -33,7 +35,7 @@ import math
 import re
 import statistics
 import subprocess
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,8 +66,11 @@ PRINTED = "paper-"
 Row = dict[str, Any]
 
 
-def rows_of_sweep(folder: Path, commit: str) -> list[Row]:
-    """Return the numbers of a sweep's finished runs, and where they come from. Raises InputError without any."""
+def rows_of_sweep(folder: Path, commit: str, seen: Sequence[int] | None = None) -> list[Row]:
+    """Return the numbers of a sweep's finished runs, and where they come from. Raises InputError without any.
+
+    ``seen``: frames of which :func:`seen_numbers` are asked for; None: none are measured.
+    """
     data = read_sweep_data(folder)
     rows = []
     for group in data.groups:
@@ -75,9 +80,28 @@ def rows_of_sweep(folder: Path, commit: str) -> list[Row]:
             origin = {"commit": commit, "recipe": run.row["recipe"], "date": run.row["date"]}
             machine = {"processor": facts["processor"], "processors": facts["processors_usable"]}
             frames = len(run.row["frames"])
+            if seen is not None:
+                values |= seen_numbers(folder / "cells" / f"{run.id}.gss", seen)
             rows.append({"scene": group.scene, "name": group.label, "seed": run.seed, "frames": frames, **values,
                          **_phases(run), **origin, **machine})  # fmt: skip
     return rows
+
+
+def seen_numbers(stream: Path, frames: Sequence[int]) -> dict[str, float]:
+    """Return PSNR, dB, on pixels whose surface training cameras see, and on those that changed; decodes the stream.
+
+    Means over the frames after the first, and of each of ``frames`` what changed and is seen.
+    """
+    command = ["gsstream", "evaluate", str(stream), "--json"]
+    found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)["views"]
+
+    def mean(key: str, wanted: Callable[[int], bool]) -> float:
+        values = [view[key] for view in found if wanted(view["frame"]) and view[key] is not None]
+        return float(f"{statistics.fmean(values):.6g}")
+
+    first = found[0]["frame"]
+    numbers = {key: mean(key, lambda frame: frame != first) for key in ("psnr_seen", "psnr_changed_seen")}
+    return numbers | {f"frame_{frame}": mean("psnr_changed_seen", frame.__eq__) for frame in frames}
 
 
 def _phases(run: Run) -> dict[str, float]:
@@ -225,11 +249,11 @@ def fill(folder: Path, check: bool) -> list[Path]:
     return differ
 
 
-def take(name: str, sweep: Path, commit: str) -> None:
+def take(name: str, sweep: Path, commit: str, seen: Sequence[int] | None = None) -> None:
     """Write the numbers of a sweep to its data file."""
     path = PAGES / "data" / f"{name}.jsonl"
     path.parent.mkdir(exist_ok=True)
-    rows = merged(read_rows(name, PAGES) if path.is_file() else [], rows_of_sweep(sweep, commit))
+    rows = merged(read_rows(name, PAGES) if path.is_file() else [], rows_of_sweep(sweep, commit, seen))
     path.write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")
     print(f"{len(rows)} runs in {path}")
 
@@ -261,11 +285,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     taking.add_argument("name")
     taking.add_argument("sweep", type=Path)
     taking.add_argument("--commit", required=True, help="of the code that ran")
+    taking.add_argument("--seen", type=int, nargs="*", metavar="FRAME", help="measure what training cameras see, too")
     pages = commands.add_parser("fill", help="make the tables and numbers of the pages from the data")
     pages.add_argument("--check", action="store_true", help="only say which pages differ")
     given = parser.parse_args(arguments)
     if given.command == "take":
-        take(given.name, given.sweep, given.commit)
+        take(given.name, given.sweep, given.commit, given.seen)
         return 0
     if given.command == "run":
         run(given.names or all_plans, given.data, given.out)

@@ -5,12 +5,28 @@ from __future__ import annotations
 import json
 import re
 import subprocess
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
 from gsstream.core.errors import InputError
-from tools.results import NUMBER, PAGES, PLANS, PRINTED, TABLE, fill, filled, merged, read_rows, run, table_of
+from gsstream.encode import open_recording
+from gsstream.evaluation.evaluate import evaluate
+from tools.results import (
+    NUMBER,
+    PAGES,
+    PLANS,
+    PRINTED,
+    TABLE,
+    fill,
+    filled,
+    merged,
+    read_rows,
+    run,
+    seen_numbers,
+    table_of,
+)
 
 RUN = {"scene": "a", "name": "edge", "seed": 0, "frames": 3, "psnr": 30.0, "kb": 2.0}
 
@@ -121,6 +137,23 @@ def test_a_curve_that_needs_half_of_the_bytes_has_a_bd_rate_of_minus_fifty(tmp_p
     rows.append({**RUN, "name": "halfway x=1", "kb": 100.0, "psnr": 31.0})
     found = page_of(tmp_path, rows, "<!-- some: half psnr % all --><!-- end --> %")
     assert NUMBER.sub(r"\g<value>", found) == "-50 %"
+
+
+def test_what_is_seen_is_measured_on_the_decoded_stream(tmp_path: Path) -> None:
+    """The numbers are those of ``gsstream evaluate``; a frame in which nothing changed has none."""
+    settings = ["--set", "first_frame.max_iterations=20", "--set", "stream.epochs=1", "--no-pictures", "--quiet"]
+    command = ["gsstream", "run", "--source", "demo", "--frames", "6", "--out", str(tmp_path / "run"), *settings]
+    subprocess.run(command, check=True, capture_output=True)
+    found = seen_numbers(tmp_path / "run" / "stream.gss", [5])
+    views = evaluation_of(tmp_path / "run")
+    assert found["frame_5"] == pytest.approx(views[5]["psnr_changed_seen"], rel=1e-5)
+    assert found["psnr_seen"] == pytest.approx(sum(view["psnr_seen"] for view in views[1:]) / 5, rel=1e-5)
+
+
+def evaluation_of(folder: Path) -> list[dict[str, float]]:
+    """What an evaluation from Python says of each frame, of one test camera."""
+    with open_recording("demo") as source:
+        return [asdict(view) for view in evaluate(folder / "stream.gss", source).views]
 
 
 def test_rows_taken_twice_keep_the_commit_that_ran_them() -> None:

@@ -53,10 +53,8 @@ class Change:
             return values * grown[: self.height, : self.width, None]
         # Nine tenths of a picture stand still: where nothing is copied, the memory is not even touched.
         out, source = np.zeros(values.shape, np.float32), values.numpy()
-        for row, marks in enumerate(self.tiles[view].numpy()):
-            lines = slice(row * TILE, (row + 1) * TILE)
-            for first, last in _runs(marks):
-                out[lines, first * TILE : last * TILE] = source[lines, first * TILE : last * TILE]
+        for region in _regions(self.tiles[view].numpy()):
+            out[region] = source[region]
         return torch.from_numpy(out)
 
     def votes(self, means: torch.Tensor, cameras: Cameras) -> torch.Tensor:
@@ -92,10 +90,12 @@ class Change:
         return inside, v.astype(np.int32) * np.int32(-(-self.width // TILE)) + u.astype(np.int32)
 
 
-def _runs(marks: BoolArray) -> Iterator[tuple[int, int]]:
-    """(first, one after the last) place of each run of marks [n] bool."""
-    edges = np.flatnonzero(np.diff(marks, prepend=False, append=False)).tolist()
-    return zip(edges[::2], edges[1::2], strict=True)
+def _regions(tiles: BoolArray) -> Iterator[tuple[slice, slice]]:
+    """Rows and columns of pixels of each run of marked tiles [rows, columns] bool that lie side by side."""
+    padded = np.pad(tiles, ((0, 0), (1, 1)))
+    rows, edges = np.nonzero(padded[:, 1:] != padded[:, :-1])  # a run begins and ends at an edge
+    for row, first, last in zip(rows[::2].tolist(), edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        yield slice(row * TILE, (row + 1) * TILE), slice(first * TILE, last * TILE)
 
 
 def detect_changed_tiles(previous: Frame, frame: Frame, threshold: float) -> Change | None:

@@ -16,7 +16,7 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.encode import encoder_for, open_recording
 from gsstream.engine.frame0.first_layer import largest_error_mask
-from gsstream.engine.frame0.hutchinson import TrainingViews
+from gsstream.engine.frame0.hutchinson import TrainingViews, random_signs
 from gsstream.engine.frame0.prune import prune_by_error, removal_errors, retained_rows
 from gsstream.packet import EncodedPacket, PacketKind, decode_packet, encode_key, first_layer
 from gsstream.packet.base import parse_packet
@@ -27,6 +27,21 @@ from gsstream.parts.render.reference import ReferenceRenderer
 
 BLACK = (0.0, 0.0, 0.0)
 GROWING = {"first_frame.max_iterations": 60}
+
+
+@given(shape=st.lists(st.integers(1, 9), min_size=1, max_size=3), seed=st.integers(0, 999))
+def test_random_signs_are_signs_of_any_shape(shape: list[int], seed: int) -> None:
+    signs = random_signs(torch.empty(shape), torch.Generator().manual_seed(seed))
+    assert signs.shape == torch.Size(shape)
+    assert signs.dtype == torch.float32
+    assert bool((signs.abs() == 1).all())
+
+
+def test_random_signs_are_fair_and_independent_of_those_beside_and_below() -> None:
+    signs = random_signs(torch.empty(200, 300, 3), torch.Generator().manual_seed(2))
+    pairs = (signs, signs[1:] * signs[:-1], signs[:, 1:] * signs[:, :-1], signs[..., 1:] * signs[..., :-1])
+    for values in pairs:  # five standard deviations of the mean of so many fair coins
+        assert abs(float(values.mean())) < 5 / values.numel() ** 0.5
 
 
 @pytest.fixture(scope="module")

@@ -140,7 +140,7 @@ def test_a_curve_that_needs_half_of_the_bytes_has_a_bd_rate_of_minus_fifty(tmp_p
 
 
 def test_what_is_seen_is_measured_on_the_decoded_stream(tmp_path: Path) -> None:
-    """The numbers are those of ``gsstream evaluate``; a frame in which nothing changed has none."""
+    """The numbers are means of what an evaluation of each frame says."""
     settings = ["--set", "first_frame.max_iterations=20", "--set", "stream.epochs=1", "--no-pictures", "--quiet"]
     command = ["gsstream", "run", "--source", "demo", "--frames", "6", "--out", str(tmp_path / "run"), *settings]
     subprocess.run(command, check=True, capture_output=True)

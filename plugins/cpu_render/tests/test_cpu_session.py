@@ -9,9 +9,10 @@ from cpu_scenes import BACKGROUND, HEIGHT, WIDTH
 from gsstream_cpu_render.arrays import SplatArrays
 from gsstream_cpu_render.pool import acquire_rasterizer, release_idle_memory
 from gsstream_cpu_render.renderer import CpuRenderer
+from test_cpu_fit import comparison
 from test_cpu_renderer import N, backpropagate, leaves, replaced, rig, scene, upstream
 
-from gsstream.api import Gaussians, InputError, RenderSession
+from gsstream.api import Gaussians, InputError, RenderSession, WrtRows
 
 Scene = Gaussians[torch.Tensor]
 
@@ -113,6 +114,22 @@ def test_a_view_that_outgrows_the_budget_goes_and_leaves_the_pool_small() -> Non
     assert session.cache_bytes().total <= budget
     del session
     assert release_idle_memory() < budget, "at most the one view that was drawn without a cache"
+
+
+def test_layers_do_not_pile_up_where_something_has_changed_before() -> None:
+    """What changes wanders over the picture; only the tiles of the last frame keep the layers of what stands still."""
+    whole = scene(5)
+    places = [rows.sort().values for rows in whole.means[:, 0].argsort().split(N // 8)]
+
+    def kept(wandering: list[torch.Tensor]) -> int:
+        session = CpuRenderer(CpuRenderer.Config(cache_mb=100)).open(whole, None, rig(), BACKGROUND)
+        for ids in wandering:
+            session.narrow(ids)
+            session.loss_and_grad(0, comparison(), WrtRows(whole.rows(ids)))
+            session = session.commit(whole, ids)
+        return session.cache_bytes().total
+
+    assert kept([*places, places[-1], places[-1]]) < 1.1 * kept([places[-1]] * 3)
 
 
 def test_cache_bytes_follow_views_and_gaussians() -> None:

@@ -35,7 +35,7 @@ import math
 import re
 import statistics
 import subprocess
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,7 @@ from gsstream_lab.report.rate_curves import bd_rate
 
 from gsstream.core.errors import InputError
 from gsstream.evaluation.summary import format_table
+from tools.seen import seen_numbers
 
 ROOT = Path(__file__).parents[1]
 PAGES, PLANS = ROOT / "docs" / "results", ROOT / "configs" / "sweeps" / "results"
@@ -85,23 +86,6 @@ def rows_of_sweep(folder: Path, commit: str, seen: Sequence[int] | None = None) 
             rows.append({"scene": group.scene, "name": group.label, "seed": run.seed, "frames": frames, **values,
                          **_phases(run), **origin, **machine})  # fmt: skip
     return rows
-
-
-def seen_numbers(stream: Path, frames: Sequence[int]) -> dict[str, float]:
-    """Return PSNR, dB, on pixels whose surface training cameras see, and on those that changed; decodes the stream.
-
-    Means over the frames after the first, and of each of ``frames`` what changed and is seen.
-    """
-    command = ["gsstream", "evaluate", str(stream), "--json"]
-    found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)["views"]
-
-    def mean(key: str, wanted: Callable[[int], bool]) -> float:
-        values = [view[key] for view in found if wanted(view["frame"]) and view[key] is not None]
-        return float(f"{statistics.fmean(values):.6g}")
-
-    first = found[0]["frame"]
-    numbers = {key: mean(key, lambda frame: frame != first) for key in ("psnr_seen", "psnr_changed_seen")}
-    return numbers | {f"frame_{frame}": mean("psnr_changed_seen", frame.__eq__) for frame in frames}
 
 
 def _phases(run: Run) -> dict[str, float]:

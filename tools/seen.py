@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
-import json
+import math
 import statistics
-import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+
+from gsstream.cli.streams import named_recording
+from gsstream.engine.run.recording import reopen_recording
+from gsstream.evaluation.evaluate import evaluate
+from gsstream.player.playback import Playback
+from gsstream.plugins.catalog import load_catalog
 
 
 def seen_numbers(stream: Path, frames: Sequence[int]) -> dict[str, float]:
     """Return PSNR, dB, on pixels whose surface training cameras see, and on those that changed; decodes the stream.
 
-    Means over the frames after the first, and of each of ``frames`` what changed and is seen.
+    Means over the frames after the first, and of each of ``frames`` what changed and is seen. What is not defined, as
+    where nothing changed, is left out.
     """
-    command = ["gsstream", "evaluate", str(stream), "--json"]
-    found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)["views"]
-
-    def mean(key: str, wanted: Callable[[int], bool]) -> float:
-        values = [view[key] for view in found if wanted(view["frame"]) and view[key] is not None]
-        return float(f"{statistics.fmean(values):.6g}")
-
-    first = found[0]["frame"]
-    numbers = {key: mean(key, lambda frame: frame != first) for key in ("psnr_seen", "psnr_changed_seen")}
-    return numbers | {f"frame_{frame}": mean("psnr_changed_seen", frame.__eq__) for frame in frames}
+    with Playback(stream) as playback:
+        meta = playback.meta
+    catalog = load_catalog()
+    source = reopen_recording(named_recording(stream, meta, catalog), meta.recipe, catalog)
+    try:
+        found = evaluate(stream, source)
+    finally:
+        source.close()
+    series = {key: found.series(key) for key in ("psnr_seen", "psnr_changed_seen")}
+    later = {
+        key: [value for value in list(values.values())[1:] if math.isfinite(value)] for key, values in series.items()
+    }
+    numbers = {key: statistics.fmean(values) for key, values in later.items() if values}
+    numbers |= {f"frame_{frame}": series["psnr_changed_seen"][frame] for frame in frames}
+    return {key: float(f"{value:.6g}") for key, value in numbers.items() if math.isfinite(value)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import subprocess
+import sys
 from dataclasses import asdict
 from pathlib import Path
 
@@ -142,7 +143,8 @@ def test_a_curve_that_needs_half_of_the_bytes_has_a_bd_rate_of_minus_fifty(tmp_p
 def test_what_is_seen_is_measured_on_the_decoded_stream(tmp_path: Path) -> None:
     """The numbers are means of what an evaluation of each frame says."""
     settings = ["--set", "first_frame.max_iterations=20", "--set", "stream.epochs=1", "--no-pictures", "--quiet"]
-    command = ["gsstream", "run", "--source", "demo", "--frames", "6", "--out", str(tmp_path / "run"), *settings]
+    program = [sys.executable, "-c", "from gsstream.cli.main import main; main()"]
+    command = [*program, "run", "--source", "demo", "--frames", "6", "--out", str(tmp_path / "run"), *settings]
     subprocess.run(command, check=True, capture_output=True)
     found = seen_numbers(tmp_path / "run" / "stream.gss", [5])
     views = evaluation_of(tmp_path / "run")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
 from gsstream.cli.streams import named_recording
 from gsstream.engine.run.recording import reopen_recording
 from gsstream.evaluation.evaluate import evaluate
+from gsstream.evaluation.records import mean
 from gsstream.player.playback import Playback
 from gsstream.plugins.catalog import load_catalog
 
@@ -29,9 +29,6 @@ def seen_numbers(stream: Path, frames: Sequence[int]) -> dict[str, float]:
     finally:
         source.close()
     series = {key: found.series(key) for key in ("psnr_seen", "psnr_changed_seen")}
-    later = {
-        key: [value for value in list(values.values())[1:] if math.isfinite(value)] for key, values in series.items()
-    }
-    numbers = {key: statistics.fmean(values) for key, values in later.items() if values}
+    numbers = {key: mean(list(values.values())[1:]) for key, values in series.items()}
     numbers |= {f"frame_{frame}": series["psnr_changed_seen"][frame] for frame in frames}
     return {key: float(f"{value:.6g}") for key, value in numbers.items() if math.isfinite(value)}

@@ -14,20 +14,8 @@ import pytest
 from gsstream.core.errors import InputError
 from gsstream.encode import open_recording
 from gsstream.evaluation.evaluate import evaluate
-from tools.results import (
-    NUMBER,
-    PAGES,
-    PLANS,
-    PRINTED,
-    TABLE,
-    fill,
-    filled,
-    merged,
-    read_rows,
-    run,
-    seen_numbers,
-    table_of,
-)
+from tools.results import NUMBER, PAGES, PLANS, PRINTED, TABLE, fill, filled, merged, read_rows, run, table_of
+from tools.seen import seen_numbers
 
 RUN = {"scene": "a", "name": "edge", "seed": 0, "frames": 3, "psnr": 30.0, "kb": 2.0}
 

@@ -42,11 +42,11 @@ class HeldOut:
         out: dict[str, Any] = {"psnr": {}, "ssim": {}, "psnr_moving": {}, "psnr_changed": {}}
         for view, name in enumerate(frame.cameras.ids):
             image = self.render(state, frame, view)
-            truth = frame.image(view)
+            truth, first = frame.image(view), self._first.image(view)
             out["psnr"][name] = _finite(psnr(image, truth))
             out["ssim"][name] = _finite(ssim(image, truth))
-            out["psnr_moving"][name] = self._moving(image, truth, view)
-            out["psnr_changed"][name] = _finite(psnr(image, truth, changed_mask(truth, self._first.image(view))))
+            out["psnr_moving"][name] = self._moving(image, truth, first, view)
+            out["psnr_changed"][name] = _finite(psnr(image, truth, changed_mask(truth, first)))
         return out
 
     def doubt(self, state: MethodState, train: Frame, measured: Mapping[str, float | None]) -> str:
@@ -77,11 +77,10 @@ class HeldOut:
             output = self._renderer.render(gaussians, frame.cameras, view, background)
         return np.asarray(np.clip(output.image.numpy(), 0, 1))
 
-    def _moving(self, image: FloatArray, truth: FloatArray, view: int) -> float | None:
-        if self._first is None or not self._sigma:
+    def _moving(self, image: FloatArray, truth: FloatArray, first: FloatArray, view: int) -> float | None:
+        if not self._sigma:
             return None
-        mask = moving_mask(truth, self._first.image(view), self._sigma[view])
-        return _finite(psnr(image, truth, mask))
+        return _finite(psnr(image, truth, moving_mask(truth, first, self._sigma[view])))
 
 
 def _noise(first: Frame, second: Frame) -> list[float]:

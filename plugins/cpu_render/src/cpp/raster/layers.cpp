@@ -142,9 +142,8 @@ void extend(const LayerSource& source, std::size_t index, TileLayers& tile, Work
 void Layers::clear(std::size_t tiles) {
   tiles_.resize(tiles);
   for (auto& tile : tiles_) {
-    if (!tile) continue;
-    if (!tile->settled) tile.reset();  // not used since the last clear: what changes has moved on
-    else tile->settled = tile->current = 0;
+    if (tile && !tile->settled) tile.reset();  // not used since the last clear: what changes has moved on
+    if (tile) tile->settled = tile->current = 0;
   }
   valid_ = true;
 }

@@ -123,7 +123,8 @@ def test_pictures_of_320_pixels_and_fewer_leave_every_setting_as_it_is(width: in
 def test_settings_follow_the_width() -> None:
     """Where they were measured to be right: 640 x 360 and 1352 x 1014."""
     assert enlargement(1352) == pytest.approx(4.225)
-    assert 3e-4 * densify_factor(1352) == pytest.approx(1.5e-4, rel=0.05)
+    assert 3e-4 * densify_factor(676) == pytest.approx(2.1e-4, rel=0.05)
+    assert 3e-4 * densify_factor(1352) == pytest.approx(1.2e-4, rel=0.05)
     assert 10 * prune_factor(640) == pytest.approx(5, rel=0.1)
     assert 10 * prune_factor(1352) == pytest.approx(2, rel=0.1)
     assert bit_price_factor(640 * 360) == pytest.approx(2.28, rel=0.01)

@@ -16,7 +16,7 @@ from gsstream.core.deferred import deferred_checks
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, shrink_frame
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
-from gsstream.core.picture_size import densify_factor, prune_factor
+from gsstream.core.picture_size import area_price, densify_factor, prune_factor
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import VARIABLE, Checks, Look
@@ -27,6 +27,7 @@ from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.engine.fit.nearest import neighbour_distance
 from gsstream.engine.fit.photometric import PhotometricLoss
 from gsstream.engine.frame0.hutchinson import TrainingViews
+from gsstream.engine.frame0.penalties import add_penalty_grad
 from gsstream.engine.frame0.prune import prune_by_error
 from gsstream.engine.frame0.pyramid import Pyramid, PyramidLevel, keep_widths, plan_pyramid
 from gsstream.engine.frame0.regularisers import Dropout, choose_regularisers
@@ -211,7 +212,10 @@ class FirstFrameRun:
         if weight := self.regularisers.smoothness_at(iteration, self.iterations):
             self.smooth_depth.add_grad(wrt.placed(), view, found.grad, weight)
         self.table.set_lr("means", self.extent * self.level.lr_at(iteration))
-        self.table.step(self._with_penalty_grad(found.grad))
+        scene = self.gaussians().map(torch.Tensor.detach)
+        price = self._area_price(iteration)
+        add_penalty_grad(found.grad, scene, self.frame.cameras, view, self.extent, price)
+        self.table.step(dict(found.grad.items()))
         if found.means2d is not None:
             self.statistics = self.statistics.add(found.means2d * self.half_size)
             if iteration >= schedule.DENSIFY_FROM and iteration % schedule.DENSIFY_EVERY == 0:
@@ -240,14 +244,10 @@ class FirstFrameRun:
                 self.exposure = self.exposure.centered()
         return found
 
-    def _with_penalty_grad(self, gradients: Gaussians[torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Gradients with those of the mean opacity and the mean scale, which need no graph."""
-        count = max(1, len(self.levels))
-        p = self.table["opacities"].detach().sigmoid()
-        gradients.opacities.add_(p * (1 - p), alpha=schedule.OPACITY_PENALTY / count)
-        sizes = self.table["scales"].detach().exp()
-        gradients.scales.add_(sizes, alpha=schedule.SCALE_PENALTY / (3 * count * self.extent))
-        return dict(gradients.items())
+    def _area_price(self, iteration: int) -> float:
+        """Price of what is covered: none after the pruning, so that what remains fits the pictures alone."""
+        wanted = iteration < self.pyramid.prune_at[0] * self.iterations
+        return area_price(self.whole.cameras.width) if wanted else 0.0
 
     def _densify(self) -> None:
         gaussians = self.gaussians().map(torch.Tensor.detach)

@@ -1,0 +1,61 @@
+"""What Gaussians cost besides errors in the pictures: opacity, size, and the pixels that they cover. Ours.
+
+Pictures alone do not ask for small Gaussians: many wide and faint ones on top of each other show what a few small ones
+show. Every covered pixel is blended in every iteration and whenever the stream is drawn, though. With a price on it, a
+pixel of a large picture blends a quarter fewer of them at equal quality and bytes (docs/results/extremes.md).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from gsstream.core.cameras import Cameras
+from gsstream.core.gaussians import Gaussians
+from gsstream.engine.fit import schedule
+
+#: An opacity of 1 / STEPS is the least that is blended.
+STEPS = 255
+#: Squared distance, in squared scene units, below which a Gaussian is taken to stand at it.
+NEAREST2 = 1e-12
+
+
+def add_penalty_grad(
+    gradients: Gaussians[torch.Tensor],
+    scene: Gaussians[torch.Tensor],
+    cameras: Cameras,
+    view: int,
+    extent: float,
+    area_price: float,
+) -> None:
+    """Add to the gradients those of the mean opacity, the mean scale and the pixels that are covered, without a graph.
+
+    A Gaussian of scales a, b, c and opacity o covers at distance d, in the mean over all directions, about
+    2 pi ln(255 o) (ab + ac + bc) / 3 (f / d)^2 pixels with more than 1 / 255 of its light. ``area_price`` is for one
+    Gaussian that covers the picture, which is for one Gaussian more that each pixel blends.
+
+    Arguments:
+        gradients: [N] of which ``scales`` and ``opacities`` are added to, in place.
+        scene: [N] raw values.
+        cameras: of the pictures that are compared.
+        view: camera from which distances are taken.
+        extent: of the rig, in scene units, above 0.
+        area_price: in units of the loss, at least 0; 0: what is covered has no price.
+    """
+    count = max(1, len(scene))
+    opacity, sizes = scene.opacities.sigmoid(), scene.scales.exp()
+    gradients.opacities.add_(opacity * (1 - opacity), alpha=schedule.OPACITY_PENALTY / count)
+    gradients.scales.add_(sizes, alpha=schedule.SCALE_PENALTY / (3 * count * extent))
+    if area_price == 0:
+        return
+    center = torch.as_tensor(cameras.centers[view], dtype=sizes.dtype, device=sizes.device)
+    away = scene.means - center
+    distance2 = (away * away) @ sizes.new_ones(3)
+    focal2 = float(cameras.Ks[view, 0, 0] * cameras.Ks[view, 1, 1])
+    per_area = 2 * math.pi / 3 * focal2 / (cameras.width * cameras.height) / distance2.clamp_min(NEAREST2)
+    # By the logarithm of a scale: d(ab + ac + bc) / d(ln a) = a (b + c). Nothing covers more than the picture.
+    by_axis = (sizes * (sizes @ (1 - torch.eye(3).to(sizes))) * per_area[:, None]).clamp_(max=1.0)
+    gradients.scales.addcmul_(by_axis, (STEPS * opacity).clamp_min(1.0).log()[:, None], value=area_price)
+    # By the logit of the opacity: d(ln o) / d(logit o) = 1 - o, and the areas of the axes count each area twice.
+    gradients.opacities.addcmul_(by_axis @ sizes.new_full((3,), 0.5), 1 - opacity, value=area_price)

@@ -16,6 +16,8 @@ from gsstream.engine.frame0.penalties import add_penalty_grad
 from gsstream.parts.render.reference import ReferenceRenderer
 
 SIZE, EXTENT, PRICE = 64, 3.0, 0.01
+#: Gradient of an opacity that says that the view drew the row; it is small beside the penalties.
+DRAWN = 1e-12
 
 
 def camera() -> Cameras:
@@ -35,10 +37,11 @@ def scene_of(means: torch.Tensor, scales: torch.Tensor, opacities: torch.Tensor)
 
 def grads(scene: Gaussians[torch.Tensor], price: float) -> tuple[torch.Tensor, torch.Tensor]:
     found = scene.map(torch.zeros_like)
+    found.opacities.fill_(DRAWN)
     add_penalty_grad(found, scene, camera(), 0, EXTENT, price)
     for name in ("means", "quats", "sh0"):
         assert not getattr(found, name).any()
-    return found.scales, found.opacities
+    return found.scales, found.opacities - DRAWN
 
 
 def penalty(scene: Gaussians[torch.Tensor], price: float) -> torch.Tensor:
@@ -96,6 +99,18 @@ def test_extremes_are_finite_and_cost_no_more_than_the_picture() -> None:
     assert float(by_opacity.max()) <= 1.5 * PRICE
     assert float(by_opacity.min()) >= 0
     assert not by_scale[2].any(), "nobody sees it"
+
+
+def test_only_what_the_view_drew_pays_for_what_it_covers() -> None:
+    scene = scene_of(torch.zeros(2, 3), torch.full((2, 3), -2.0), torch.zeros(2))
+    found = scene.map(torch.zeros_like)
+    found.opacities[0] = DRAWN
+    add_penalty_grad(found, scene, camera(), 0, EXTENT, PRICE)
+    free = grads(scene, 0.0)
+    assert torch.equal(found.scales[1], free[0][1])
+    assert torch.equal(found.opacities[1:], free[1][1:])
+    assert bool((found.scales[0] > free[0][0]).all())
+    assert float(found.opacities[0]) > float(free[1][0])
 
 
 def test_only_large_pictures_have_a_price() -> None:

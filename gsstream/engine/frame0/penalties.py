@@ -2,7 +2,7 @@
 
 Pictures alone do not ask for small Gaussians: many wide and faint ones on top of each other show what a few small ones
 show. Every covered pixel is blended in every iteration and whenever the stream is drawn, though. With a price on it, a
-pixel of a large picture blends a quarter fewer of them at equal quality and bytes (docs/results/extremes.md).
+pixel of a large picture blends three tenths fewer of them at equal quality and bytes (docs/results/extremes.md).
 """
 
 from __future__ import annotations
@@ -33,10 +33,12 @@ def add_penalty_grad(
 
     A Gaussian of scales a, b, c and opacity o covers at distance d, in the mean over all directions, about
     2 pi ln(255 o) (ab + ac + bc) / 3 (f / d)^2 pixels with more than 1 / 255 of its light. ``area_price`` is for one
-    Gaussian that covers the picture, which is for one Gaussian more that each pixel blends.
+    Gaussian that covers the picture, which is for one Gaussian more that each pixel blends. Only what the view drew
+    pays: else a Gaussian that one camera sees would pay for all of them, and what few cameras see would wear away.
 
     Arguments:
-        gradients: [N] of which ``scales`` and ``opacities`` are added to, in place.
+        gradients: [N] by the view's loss, of which ``scales`` and ``opacities`` are added to, in place. A row was drawn
+            where that of its opacity is not 0.
         scene: [N] raw values.
         cameras: of the pictures that are compared.
         view: camera from which distances are taken.
@@ -44,6 +46,7 @@ def add_penalty_grad(
         area_price: in units of the loss, at least 0; 0: what is covered has no price.
     """
     count = max(1, len(scene))
+    drawn = (gradients.opacities != 0).to(scene.scales)
     opacity, sizes = scene.opacities.sigmoid(), scene.scales.exp()
     gradients.opacities.add_(opacity * (1 - opacity), alpha=schedule.OPACITY_PENALTY / count)
     gradients.scales.add_(sizes, alpha=schedule.SCALE_PENALTY / (3 * count * extent))
@@ -53,7 +56,7 @@ def add_penalty_grad(
     away = scene.means - center
     distance2 = (away * away) @ sizes.new_ones(3)
     focal2 = float(cameras.Ks[view, 0, 0] * cameras.Ks[view, 1, 1])
-    per_area = 2 * math.pi / 3 * focal2 / (cameras.width * cameras.height) / distance2.clamp_min(NEAREST2)
+    per_area = 2 * math.pi / 3 * focal2 / (cameras.width * cameras.height) * drawn / distance2.clamp_min(NEAREST2)
     # By the logarithm of a scale: d(ab + ac + bc) / d(ln a) = a (b + c). Nothing covers more than the picture.
     by_axis = (sizes * (sizes @ (1 - torch.eye(3).to(sizes))) * per_area[:, None]).clamp_(max=1.0)
     gradients.scales.addcmul_(by_axis, (STEPS * opacity).clamp_min(1.0).log()[:, None], value=area_price)

@@ -1,15 +1,14 @@
 """Numbers of the results pages: from plans of sweeps to docs/results/data, and from there into the pages.
 
     python -m tools.results run --data DATA --out RUNS [NAME ...]
-    python -m tools.results take NAME SWEEP --commit HASH [--seen FRAME ...]
+    python -m tools.results take NAME SWEEP --commit HASH [--at FRAME ...]
     python -m tools.results fill [--check]
 
 The first runs the plans of ``configs/sweeps/results`` one after the other (or goes on with them), takes their numbers
 and fills in the pages. The second takes the numbers of one sweep that ran elsewhere: one run a line, in the file
-``NAME.jsonl`` of ``docs/results/data``; rows that the sweep does not hold stay as they are. With ``--seen`` its streams
-are decoded once more, for PSNR on pixels that training cameras see, too: the means over frames, and of each FRAME what
-changed, as ``frame_8``. The third fills in every table of a page between two comments: of rows of files, of those with
-some names, or of a table of the paper:
+``NAME.jsonl`` of ``docs/results/data``; rows that the sweep does not hold stay as they are. With ``--at`` the PSNR, dB,
+of what changed and is seen in each FRAME is taken, too, as ``frame_8``. The third fills in every table of a page
+between two comments: of rows of files, of those with some names, or of a table of the paper:
 
     <!-- rows of protocol, protocol-peers: psnr_first psnr kb -->
     <!-- rows of components, only 1-dense 5-hfp: psnr kb -->
@@ -35,7 +34,7 @@ import math
 import re
 import statistics
 import subprocess
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +46,6 @@ from gsstream_lab.report.rate_curves import bd_rate
 
 from gsstream.core.errors import InputError
 from gsstream.evaluation.summary import format_table
-from tools.seen import seen_numbers
 
 ROOT = Path(__file__).parents[1]
 PAGES, PLANS = ROOT / "docs" / "results", ROOT / "configs" / "sweeps" / "results"
@@ -67,10 +65,10 @@ PRINTED = "paper-"
 Row = dict[str, Any]
 
 
-def rows_of_sweep(folder: Path, commit: str, seen: Sequence[int] | None = None) -> list[Row]:
+def rows_of_sweep(folder: Path, commit: str, at: Sequence[int] = ()) -> list[Row]:
     """Return the numbers of a sweep's finished runs, and where they come from. Raises InputError without any.
 
-    ``seen``: frames of which :func:`seen_numbers` are asked for; None: none are measured.
+    ``at``: frames whose PSNR on what changed and is seen stands on its own.
     """
     data = read_sweep_data(folder)
     rows = []
@@ -81,11 +79,16 @@ def rows_of_sweep(folder: Path, commit: str, seen: Sequence[int] | None = None) 
             origin = {"commit": commit, "recipe": run.row["recipe"], "date": run.row["date"]}
             machine = {"processor": facts["processor"], "processors": facts["processors_usable"]}
             frames = len(run.row["frames"])
-            if seen is not None:
-                values |= seen_numbers(folder / "cells" / f"{run.id}.gss", seen)
+            values |= {f"frame_{frame}": _changed_seen(run.row["frames"][frame]) for frame in at}
             rows.append({"scene": group.scene, "name": group.label, "seed": run.seed, "frames": frames, **values,
                          **_phases(run), **origin, **machine})  # fmt: skip
     return rows
+
+
+def _changed_seen(frame: Mapping[str, Any]) -> float:
+    """Return a frame's mean PSNR over test cameras, dB, on pixels that changed and that training cameras see."""
+    found = [value for value in frame["psnr_changed_seen"].values() if value is not None]
+    return float(f"{statistics.fmean(found):.6g}")
 
 
 def _phases(run: Run) -> dict[str, float]:
@@ -233,11 +236,11 @@ def fill(folder: Path, check: bool) -> list[Path]:
     return differ
 
 
-def take(name: str, sweep: Path, commit: str, seen: Sequence[int] | None = None) -> None:
+def take(name: str, sweep: Path, commit: str, at: Sequence[int] = ()) -> None:
     """Write the numbers of a sweep to its data file."""
     path = PAGES / "data" / f"{name}.jsonl"
     path.parent.mkdir(exist_ok=True)
-    rows = merged(read_rows(name, PAGES) if path.is_file() else [], rows_of_sweep(sweep, commit, seen))
+    rows = merged(read_rows(name, PAGES) if path.is_file() else [], rows_of_sweep(sweep, commit, at))
     path.write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")
     print(f"{len(rows)} runs in {path}")
 
@@ -269,12 +272,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     taking.add_argument("name")
     taking.add_argument("sweep", type=Path)
     taking.add_argument("--commit", required=True, help="of the code that ran")
-    taking.add_argument("--seen", type=int, nargs="*", metavar="FRAME", help="measure what training cameras see, too")
+    taking.add_argument("--at", type=int, nargs="*", default=[], metavar="FRAME", help="what changed in it and is seen")
     pages = commands.add_parser("fill", help="make the tables and numbers of the pages from the data")
     pages.add_argument("--check", action="store_true", help="only say which pages differ")
     given = parser.parse_args(arguments)
     if given.command == "take":
-        take(given.name, given.sweep, given.commit, given.seen)
+        take(given.name, given.sweep, given.commit, given.at)
         return 0
     if given.command == "run":
         run(given.names or all_plans, given.data, given.out)

@@ -14,8 +14,20 @@ import pytest
 from gsstream.core.errors import InputError
 from gsstream.encode import open_recording
 from gsstream.evaluation.evaluate import evaluate
-from tools.results import NUMBER, PAGES, PLANS, PRINTED, TABLE, fill, filled, merged, read_rows, run, table_of
-from tools.seen import seen_numbers
+from tools.results import (
+    NUMBER,
+    PAGES,
+    PLANS,
+    PRINTED,
+    TABLE,
+    fill,
+    filled,
+    merged,
+    read_rows,
+    rows_of_sweep,
+    run,
+    table_of,
+)
 
 RUN = {"scene": "a", "name": "edge", "seed": 0, "frames": 3, "psnr": 30.0, "kb": 2.0}
 
@@ -128,22 +140,22 @@ def test_a_curve_that_needs_half_of_the_bytes_has_a_bd_rate_of_minus_fifty(tmp_p
     assert NUMBER.sub(r"\g<value>", found) == "-50 %"
 
 
-def test_what_is_seen_is_measured_on_the_decoded_stream(tmp_path: Path) -> None:
-    """The numbers are means of what an evaluation of each frame says."""
-    settings = ["--set", "first_frame.max_iterations=20", "--set", "stream.epochs=1", "--no-pictures", "--quiet"]
+def test_what_changed_in_a_frame_and_is_seen_is_that_of_an_evaluation(tmp_path: Path) -> None:
+    """The sweep measured while it ran; here its stream is decoded once more."""
+    plan = tmp_path / "plan.yaml"
+    settings = "{first_frame.max_iterations: 20, stream.epochs: 1}"
+    scenes = "scenes:\n  - {name: demo, uri: demo, frames: 6}\n"
+    plan.write_text(
+        f"name: small\nsplit: reporting\n{scenes}variants:\n  - {{name: edge, method: s2gs-edge, set: {settings}}}\n"
+    )
     program = [sys.executable, "-c", "from gsstream.cli.main import main; main()"]
-    command = [*program, "run", "--source", "demo", "--frames", "6", "--out", str(tmp_path / "run"), *settings]
-    subprocess.run(command, check=True, capture_output=True)
-    found = seen_numbers(tmp_path / "run" / "stream.gss", [5])
-    views = evaluation_of(tmp_path / "run")
-    assert found["frame_5"] == pytest.approx(views[5]["psnr_changed_seen"], rel=1e-5)
-    assert found["psnr_seen"] == pytest.approx(sum(view["psnr_seen"] for view in views[1:]) / 5, rel=1e-5)
-
-
-def evaluation_of(folder: Path) -> list[dict[str, float]]:
-    """What an evaluation from Python says of each frame, of one test camera."""
+    subprocess.run([*program, "sweep", str(plan), "--out", str(tmp_path / "out")], check=True, capture_output=True)
+    (row,) = rows_of_sweep(tmp_path / "out", "abc", at=[5])
+    (stream,) = (tmp_path / "out" / "cells").glob("*.gss")
     with open_recording("demo") as source:
-        return [asdict(view) for view in evaluate(folder / "stream.gss", source).views]
+        views = [asdict(view) for view in evaluate(stream, source).views]
+    assert row["frame_5"] == pytest.approx(views[5]["psnr_changed_seen"], rel=1e-5)
+    assert row["psnr_seen"] == pytest.approx(sum(view["psnr_seen"] for view in views[1:]) / 5, rel=1e-5)
 
 
 def test_rows_taken_twice_keep_the_commit_that_ran_them() -> None:

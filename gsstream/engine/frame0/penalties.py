@@ -2,7 +2,7 @@
 
 Pictures alone do not ask for small Gaussians: many wide and faint ones on top of each other show what a few small ones
 show. Every covered pixel is blended in every iteration and whenever the stream is drawn, though. With a price on it, a
-pixel of a large picture blends three tenths fewer of them at equal quality and bytes (docs/results/extremes.md).
+pixel of a large picture blends three tenths fewer of them, at nearly equal quality (docs/results/extremes.md).
 """
 
 from __future__ import annotations

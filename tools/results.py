@@ -34,7 +34,7 @@ import math
 import re
 import statistics
 import subprocess
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,7 @@ from gsstream_lab.report.quantities import BY_KEY, cell, spread
 from gsstream_lab.report.rate_curves import bd_rate
 
 from gsstream.core.errors import InputError
+from gsstream.evaluation.records import mean_of_views
 from gsstream.evaluation.summary import format_table
 
 ROOT = Path(__file__).parents[1]
@@ -74,21 +75,16 @@ def rows_of_sweep(folder: Path, commit: str, at: Sequence[int] = ()) -> list[Row
     rows = []
     for group in data.groups:
         for run in group.runs:
-            values = {key: float(f"{value:.6g}") for key, value in run.values.items() if math.isfinite(value)}
+            alone = {f"frame_{t}": mean_of_views([run.row["frames"][t]], "psnr_changed_seen") for t in at}
+            found = {**run.values, **alone}
+            values = {key: float(f"{value:.6g}") for key, value in found.items() if math.isfinite(value)}
             facts = data.table.machines[run.row["machine"]]["facts"]
             origin = {"commit": commit, "recipe": run.row["recipe"], "date": run.row["date"]}
             machine = {"processor": facts["processor"], "processors": facts["processors_usable"]}
             frames = len(run.row["frames"])
-            values |= {f"frame_{frame}": _changed_seen(run.row["frames"][frame]) for frame in at}
             rows.append({"scene": group.scene, "name": group.label, "seed": run.seed, "frames": frames, **values,
                          **_phases(run), **origin, **machine})  # fmt: skip
     return rows
-
-
-def _changed_seen(frame: Mapping[str, Any]) -> float:
-    """Return a frame's mean PSNR over test cameras, dB, on pixels that changed and that training cameras see."""
-    found = [value for value in frame["psnr_changed_seen"].values() if value is not None]
-    return float(f"{statistics.fmean(found):.6g}")
 
 
 def _phases(run: Run) -> dict[str, float]:

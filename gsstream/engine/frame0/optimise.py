@@ -205,14 +205,13 @@ class FirstFrameRun:
         view, self.parts.where.iteration = self._next_view(), iteration
         last = self.pyramid.densify_until * self.iterations
         densify = iteration + schedule.DENSIFY_EVERY >= schedule.DENSIFY_FROM and iteration <= last
-        rows = self._disturbed(self.gaussians().map(torch.Tensor.detach))
-        rows, keep = self.dropout.thin_out(rows)
+        scene = self.gaussians().map(torch.Tensor.detach)
+        rows, keep = self.dropout.thin_out(self._disturbed(scene))
         wrt = WrtScene(rows, densify, exposure=self.exposure is not None, keep=keep)
         found = self._loss_and_grad(view, wrt)
         if weight := self.regularisers.smoothness_at(iteration, self.iterations):
             self.smooth_depth.add_grad(wrt.placed(), view, found.grad, weight)
         self.table.set_lr("means", self.extent * self.level.lr_at(iteration))
-        scene = self.gaussians().map(torch.Tensor.detach)
         price = self._area_price(iteration)
         add_penalty_grad(found.grad, scene, self.frame.cameras, view, self.extent, price)
         self.table.step(dict(found.grad.items()))

@@ -14,9 +14,8 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import Gaussians
 from gsstream.engine.fit import schedule
+from gsstream.parts.render.reference import ALPHA_CUT
 
-#: An opacity of 1 / STEPS is the least that is blended.
-STEPS = 255
 #: Squared distance, in squared scene units, below which a Gaussian is taken to stand at it.
 NEAREST2 = 1e-12
 
@@ -59,6 +58,6 @@ def add_penalty_grad(
     per_area = 2 * math.pi / 3 * focal2 / (cameras.width * cameras.height) * drawn / distance2.clamp_min(NEAREST2)
     # By the logarithm of a scale: d(ab + ac + bc) / d(ln a) = a (b + c). Nothing covers more than the picture.
     by_axis = (sizes * (sizes @ (1 - torch.eye(3).to(sizes))) * per_area[:, None]).clamp_(max=1.0)
-    gradients.scales.addcmul_(by_axis, (STEPS * opacity).clamp_min(1.0).log()[:, None], value=area_price)
+    gradients.scales.addcmul_(by_axis, (1 / ALPHA_CUT * opacity).clamp_min(1.0).log()[:, None], value=area_price)
     # By the logit of the opacity: d(ln o) / d(logit o) = 1 - o, and the areas of the axes count each area twice.
     gradients.opacities.addcmul_(by_axis @ sizes.new_full((3,), 0.5), 1 - opacity, value=area_price)

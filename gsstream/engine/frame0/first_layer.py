@@ -23,7 +23,9 @@ def first_layer_mask(
         return None
     generator = rng.stream("first layer", frame.index)
     views = TrainingViews(parts.renderer, frame, exposure, parts.background)
-    errors, _ = removal_errors(views, gaussians, generator)
+    # One probe of a camera is enough for an order: with four the first layer shows 0.1 dB more, and a large picture
+    # takes a second longer.
+    errors, _ = removal_errors(views, gaussians, generator, probes=1)
     return largest_error_mask(errors, share)
 
 

@@ -45,19 +45,26 @@ def add_penalty_grad(
         area_price: in units of the loss, at least 0; 0: what is covered has no price.
     """
     count = max(1, len(scene))
-    drawn = (gradients.opacities != 0).to(scene.scales)
+    drawn = gradients.opacities != 0
     opacity, sizes = scene.opacities.sigmoid(), scene.scales.exp()
     gradients.opacities.add_(opacity * (1 - opacity), alpha=schedule.OPACITY_PENALTY / count)
     gradients.scales.add_(sizes, alpha=schedule.SCALE_PENALTY / (3 * count * extent))
     if area_price == 0:
         return
-    center = torch.as_tensor(cameras.centers[view], dtype=sizes.dtype, device=sizes.device)
-    away = scene.means - center
-    distance2 = (away * away) @ sizes.new_ones(3)
+    # Axis by axis, each in a row of its own: numbers by row and by axis are slow to multiply.
+    away = _by_axis(scene.means) - torch.as_tensor(cameras.centers[view])[:, None].to(scene.means)
+    x2, y2, z2 = away * away
     focal2 = float(cameras.Ks[view, 0, 0] * cameras.Ks[view, 1, 1])
-    per_area = 2 * math.pi / 3 * focal2 / (cameras.width * cameras.height) * drawn / distance2.clamp_min(NEAREST2)
+    per_area = 2 * math.pi / 3 * focal2 / (cameras.width * cameras.height) * drawn / (x2 + y2 + z2).clamp_min(NEAREST2)
+    axes = _by_axis(sizes)
     # By the logarithm of a scale: d(ab + ac + bc) / d(ln a) = a (b + c). Nothing covers more than the picture.
-    by_axis = (sizes * (sizes @ (1 - torch.eye(3).to(sizes))) * per_area[:, None]).clamp_(max=1.0)
-    gradients.scales.addcmul_(by_axis, (1 / ALPHA_CUT * opacity).clamp_min(1.0).log()[:, None], value=area_price)
+    covered = (axes[0] + axes[1] + axes[2] - axes).mul_(axes).mul_(per_area).clamp_(max=1.0)
     # By the logit of the opacity: d(ln o) / d(logit o) = 1 - o, and the areas of the axes count each area twice.
-    gradients.opacities.addcmul_(by_axis @ sizes.new_full((3,), 0.5), 1 - opacity, value=area_price)
+    gradients.opacities.addcmul_(covered[0] + covered[1] + covered[2], 1 - opacity, value=area_price / 2)
+    covered *= (1 / ALPHA_CUT * opacity).clamp_min(1.0).log()
+    gradients.scales.add_(covered.T, alpha=area_price)
+
+
+def _by_axis(values: torch.Tensor) -> torch.Tensor:
+    """[3, N] of [N, 3], in a third of the time of a transposed copy."""
+    return torch.stack(values.unbind(1))

@@ -29,9 +29,11 @@ TRIES = 8
 
 
 def removal_errors(
-    views: TrainingViews, gaussians: Gaussians[torch.Tensor], generator: torch.Generator
+    views: TrainingViews, gaussians: Gaussians[torch.Tensor], generator: torch.Generator, *, probes: int
 ) -> tuple[torch.Tensor, float]:
     """Return the squared change of the images if each Gaussian alone is removed, and their error with all of them.
+
+    It is estimated from so many ``probes`` of every camera.
 
     Returns [N] float64, the squared change of all channels of all pixels together, and the mean squared error of a
     channel of a pixel.
@@ -39,12 +41,12 @@ def removal_errors(
     rows = replace(gaussians, opacities=gaussians.opacities.clamp(max=MAX_LOGIT))
     squares = torch.zeros_like(rows.opacities, dtype=torch.float64)
     error = 0.0
-    for probe in hutchinson_samples(views, rows, generator, each=HUTCHINSON_SAMPLES):
+    for probe in hutchinson_samples(views, rows, generator, each=probes):
         squares += probe.grad.opacities.double().square()
         error += probe.error
     # By the opacity o instead of its logit, times o, which is how far it falls: o / (o (1 - o)).
     left = 1 - rows.opacities.double().sigmoid()
-    return squares / HUTCHINSON_SAMPLES / left**2, error / (HUTCHINSON_SAMPLES * len(views.frame.cameras))
+    return squares / probes / left**2, error / (probes * len(views.frame.cameras))
 
 
 def retained_rows(errors: torch.Tensor, least: float) -> torch.Tensor:
@@ -64,7 +66,7 @@ def prune_by_error(
     What one may do without, all together may not: of ten equal Gaussians none is missed. So where the images are off by
     ``GROWTH`` times as much without all of them, only those go that are missed less.
     """
-    errors, error = removal_errors(views, gaussians, generator)
+    errors, error = removal_errors(views, gaussians, generator, probes=HUTCHINSON_SAMPLES)
     for _ in range(TRIES):
         rows = retained_rows(errors, least * error)
         if len(rows) == len(errors):

@@ -57,6 +57,10 @@ def _difference(before: Any, now: Any) -> Any:
 
 def block_sigma(means: FloatArray) -> float:
     """Return the noise of block means of a difference, image units, within its bounds."""
+    # Where most are this small no median has to be found: their deviation from it is at most twice as large.
+    small = LEAST_SIGMA / (2 * MAD_TO_SIGMA) * (1 - 1e-9)
+    if 2 * np.count_nonzero(np.abs(means) < small) > means.size:
+        return LEAST_SIGMA
     spread = MAD_TO_SIGMA * float(median_deviation(means))
     if spread <= LEAST_SIGMA:  # then it does not matter what second differences admit
         return LEAST_SIGMA

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal
 
 import numpy as np
 import torch
@@ -62,7 +61,7 @@ def found_transforms(values: torch.Tensor) -> FloatArray:
 
 def fit_transforms_adam(
     work: FitContext, start: GroupTransforms[FloatArray], unit: FloatArray, rates: Sequence[float],
-    order: np.random.Generator, measure: Measure, l1_weight: float = 0.0, tiles: Literal["all", "changed"] = "all",
+    order: np.random.Generator, measure: Measure, l1_weight: float = 0.0,
 ) -> FloatArray:  # fmt: skip
     """Return the shifts and turns [K, 6] of groups that explain the images best.
 
@@ -74,7 +73,6 @@ def fit_transforms_adam(
         order: draws the order of the views, anew for each pass.
         measure: what the steps of each number are divided by, squared.
         l1_weight: weight of the mean absolute value of all numbers, in units, beside the photometric loss.
-        tiles: "changed" compares only in tiles that changed and in those beside them.
     """
     views, (base, local) = len(work.cameras), narrow_to(work, start)
     per_step = torch.from_numpy(unit).to(base.means.device)
@@ -85,7 +83,7 @@ def fit_transforms_adam(
         values = descent.values
         now = values * per_step
         transforms = local._replace(translation=now[:, :3], rotation=now[:, 3:])
-        found = work.loss_and_grad(int(sequence[step % views]), WrtTransforms(base, transforms), tiles)
+        found = work.loss_and_grad(int(sequence[step % views]), WrtTransforms(base, transforms))
         grad = found.grad * per_step
         if l1_weight:
             grad = grad + l1_weight * values.sign() / values.numel()

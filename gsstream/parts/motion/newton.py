@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -128,9 +128,9 @@ def _shortening(longest: torch.Tensor, most: float) -> torch.Tensor:
 
 def fit_transforms_newton(
     work: FitContext, start: GroupTransforms[FloatArray], unit: FloatArray, iterations: int,
-    order: np.random.Generator, damping: Damping, settings: BodySettings, tiles: Literal["all", "changed"] = "all",
+    order: np.random.Generator, damping: Damping, settings: BodySettings,
 ) -> FloatArray:  # fmt: skip
-    """Return the translations and rotations [K, 6] of groups that minimise the loss of the images."""
+    """Return the translations and rotations [K, 6] of groups that minimise the loss where the images changed."""
     views, values = len(work.cameras), 3 * work.cameras.height * work.cameras.width
     base, local = narrow_to(work, start)
     per_step = torch.from_numpy(unit).to(base.means.device)
@@ -143,7 +143,7 @@ def fit_transforms_newton(
             descent.join_neighbours(start.center, unit, settings)
         now, view = descent.values * per_step, int(sequence[step % views])
         transforms = local._replace(translation=now[:, :3], rotation=now[:, 3:])
-        found = work.loss_and_grad(view, WrtTransforms(base, transforms, curvature=step < views), tiles)
+        found = work.loss_and_grad(view, WrtTransforms(base, transforms, curvature=step < views), "changed")
         curvature = None if found.curvature is None else found.curvature * squares * values
         descent.step(found.grad * per_step * values, curvature)
     return found_transforms(descent.values * per_step)

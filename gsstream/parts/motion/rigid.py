@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, NamedTuple, final
+from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
 from pydantic import Field
@@ -10,7 +10,7 @@ from pydantic import Field
 from gsstream.core.changes import Motion, Scene
 from gsstream.core.changes.motion import GroupTransforms, predict_transforms
 from gsstream.core.part import PartConfig
-from gsstream.core.picture_size import enlargement, is_large
+from gsstream.core.picture_size import enlargement
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.parts.motion.base import MotionPart
@@ -69,11 +69,6 @@ class Rigid(MotionPart):
         )
         longest: float = Field(default=0.5, gt=0, le=10, description="longest step, pixels at a width of 320")
         step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
-        everywhere: Literal["auto"] | bool = Field(
-            default="auto",
-            description="compare in all tiles that the groups are seen in; false: in those that changed or lie beside; "
-            "auto: in all where pictures are less than 960 pixels wide",
-        )
         least: float = Field(default=0.25, ge=0, le=10, description="motions below this many pixels are dropped")
 
     source: ClassVar[str] = "gsstream; groups of one rigid motion as in HiCoM"
@@ -110,6 +105,4 @@ class Rigid(MotionPart):
         values = 3 * work.cameras.height * work.cameras.width * len(work.cameras)
         bodies = BodySettings(config.body_cost * values**0.5, config.body_hold)
         order = rng.numpy("motion", work.index)
-        small = not is_large(work.cameras.width) if config.everywhere == "auto" else config.everywhere
-        tiles: Literal["all", "changed"] = "all" if small else "changed"
-        return fit_transforms_newton(work, start, units.row, total, order, damping, bodies, tiles)
+        return fit_transforms_newton(work, start, units.row, total, order, damping, bodies)

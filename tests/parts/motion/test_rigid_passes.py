@@ -91,19 +91,11 @@ def test_a_hurried_frame_fits_motion_in_its_share_of_the_passes(effort: float, c
     assert len(made) == calls, "two passes over three cameras, or a share of them"
 
 
-@pytest.mark.parametrize(
-    ("everywhere", "large", "tiles"),
-    [(False, 960, "changed"), (True, 1, "all"), ("auto", 960, "all"), ("auto", 1, "changed")],
-)
-def test_motions_look_everywhere_unless_told_to_look_near_the_change(
-    everywhere: Any, large: int, tiles: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """``large`` is the width from which pictures count as large; those of the case are small."""
+def test_motions_look_near_the_change() -> None:
     case = fit_fixture()
     asked = noted(case)
-    monkeypatch.setattr("gsstream.core.picture_size.LARGE", large)
-    Rigid(Rigid.Config(everywhere=everywhere)).propose(case.scene, case.work, case.rng)
-    assert set(asked) == {tiles}
+    Rigid(Rigid.Config()).propose(case.scene, case.work, case.rng)
+    assert set(asked) == {"changed"}
 
 
 @pytest.mark.parametrize(("large", "changed_alone"), [(960, False), (1, True)])

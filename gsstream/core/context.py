@@ -54,6 +54,9 @@ class FrameContext(Protocol):
     def previous_image(self, view: int) -> torch.Tensor:
         """Return [H, W, 3]: what a camera recorded in the frame that ``gaussians`` shows, in [0, 1]."""
 
+    def image_change(self, view: int) -> torch.Tensor:
+        """Return [H, W, 3]: ``image`` minus ``previous_image`` in the tiles that changed, and 0 in the others."""
+
     def previous_render(self, view: int) -> torch.Tensor:
         """Return [H, W, 3]: ``gaussians`` as a camera would record them, without a gradient."""
 

@@ -62,6 +62,9 @@ class World:
     def previous_image(self, view: int) -> torch.Tensor:
         return self.before[view]
 
+    def image_change(self, view: int) -> torch.Tensor:
+        return self.now[view] - self.before[view]
+
     def previous_render(self, view: int) -> torch.Tensor:
         with torch.no_grad():
             return RENDERER.render(self.gaussians.map(torch.Tensor.detach), self.cameras, view, BLACK).image

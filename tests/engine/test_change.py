@@ -84,6 +84,9 @@ def test_what_did_not_change_is_zero_and_the_rest_as_it_was(rows: int, columns: 
     change = Change(torch.from_numpy(tiles)[None], height, width)
     mask = np.kron(tiles, np.ones((16, 16), bool))[:height, :width, None]
     np.testing.assert_array_equal(change.only_changed(0, torch.from_numpy(values)).numpy(), np.where(mask, values, 0))
+    now, before = (torch.from_numpy(rng.integers(0, 256, values.shape).astype(np.uint8)) for _ in range(2))
+    exact = unpacked(now.numpy()) - unpacked(before.numpy())
+    np.testing.assert_array_equal(change.difference(0, now, before).numpy(), np.where(mask, exact, 0))
 
 
 THRESHOLD = 6.0

@@ -92,6 +92,11 @@ class EngineContext:
     def previous_image(self, view: int) -> torch.Tensor:
         return self.previous_images[view]
 
+    def image_change(self, view: int) -> torch.Tensor:
+        if self._change is None:
+            return self.image(view) - self.previous_image(view)
+        return self._change.difference(view, self.images.stored(view), self.previous_images.stored(view))
+
     def previous_render(self, view: int) -> torch.Tensor:
         return self.shown(self._gaussians, view)
 

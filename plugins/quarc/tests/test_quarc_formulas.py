@@ -34,11 +34,8 @@ class Seen:
         )  # fmt: skip
         self.gradients, self.cameras, self.asked = torch.tensor(gradients), rig(views), []
 
-    def image(self, view: int) -> torch.Tensor:
-        return torch.zeros(2, 2, 3)
-
-    def previous_image(self, view: int) -> torch.Tensor:
-        return torch.ones(2, 2, 3)
+    def image_change(self, view: int) -> torch.Tensor:
+        return torch.full((2, 2, 3), -1.0)
 
     def screen_gradient(self, view: int, upstream: torch.Tensor):
         assert upstream.unique().tolist() == pytest.approx([2 / 12]), "the gradient of a mean squared error"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,6 +15,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.picture_size import is_large
 from gsstream.core.processors import processors
 from gsstream.core.shapes import BoolArray, FloatArray, IntArray
+from gsstream.core.storage import unpacked
 from gsstream.engine.step.active.blocks import BLOCK, changed_blocks
 from gsstream.parts.render.base import TILE
 
@@ -51,10 +52,26 @@ class Change:
         if values.device.type != "cpu":
             grown = self.tiles[view].repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)
             return values * grown[: self.height, : self.width, None]
-        # Nine tenths of a picture stand still: where nothing is copied, the memory is not even touched.
-        out, source = np.zeros(values.shape, np.float32), values.numpy()
+        return self._in_changed(view, lambda region: values.numpy()[region])
+
+    def difference(self, view: int, now: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
+        """Return ``now - before`` [H, W, 3] in this view's changed tiles, and 0 in the others.
+
+        Arguments:
+            now, before: [H, W, 3] float32, or uint8 of which 255 is 1.0 where the processor works.
+        """
+        if now.device.type != "cpu":
+            return self.only_changed(view, now - before)
+        return self._in_changed(view, lambda region: unpacked(now.numpy()[region]) - unpacked(before.numpy()[region]))
+
+    def _in_changed(self, view: int, of: Callable[[tuple[slice, slice]], FloatArray]) -> torch.Tensor:
+        """[H, W, 3] what ``of`` says of the changed regions of a view.
+
+        Nine tenths of a picture stand still: where nothing is written, the memory is not even touched.
+        """
+        out = np.zeros((self.height, self.width, 3), np.float32)
         for region in _regions(self.tiles[view].numpy()):
-            out[region] = source[region]
+            out[region] = of(region)
         return torch.from_numpy(out)
 
     def votes(self, means: torch.Tensor, cameras: Cameras) -> torch.Tensor:

@@ -27,8 +27,8 @@ def gradient_difference(work: FitContext) -> torch.Tensor:
     """
     total: torch.Tensor = torch.zeros(len(work.gaussians), 2)
     for view in range(len(work.cameras)):
-        now = work.image(view)
-        total += work.screen_gradient(view, 2 * (work.previous_image(view) - now) / now.numel()).gradient
+        change = work.image_change(view)
+        total += work.screen_gradient(view, -2 * change / change.numel()).gradient
     difference: torch.Tensor = total.norm(dim=1) / len(work.cameras)
     return difference
 

@@ -57,9 +57,8 @@ def change_scores(work: FitContext, views: int) -> torch.Tensor:
     size = torch.zeros(len(work.gaussians))
     number = len(work.cameras)
     for view in np.unique(np.linspace(0, number - 1, min(views, number)).round().astype(int)):
-        now = work.image(int(view))
-        upstream = 2 * (work.previous_image(int(view)) - now) / now.numel()
-        size += work.screen_gradient(int(view), upstream).gradient.norm(dim=1)
+        change = work.image_change(int(view))
+        size += work.screen_gradient(int(view), -2 * change / change.numel()).gradient.norm(dim=1)
     reached = size > 0
     if not bool(reached.any()):
         return size

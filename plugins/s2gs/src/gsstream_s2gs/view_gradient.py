@@ -181,9 +181,10 @@ class ViewSpaceGradient(ConfidenceEstimator):
 
     def _upstream(self, context: FrameContext, view: int) -> torch.Tensor:
         """[H, W, 3] derivative of E_t - E_{t-1} with respect to the render of frame t-1."""
-        now, before = context.image(view), context.previous_image(view)
         if self.config.loss == "mse":
-            return (before - now).mul_(2 / before.numel())
+            change = context.image_change(view)
+            return change.mul_(-2 / change.numel())
+        now, before = context.image(view), context.previous_image(view)
         render = context.previous_render(view)
         pixels = before.shape[0] * before.shape[1]
         return (self._direction(render - now) - self._direction(render - before)) / pixels

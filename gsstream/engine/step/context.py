@@ -171,7 +171,8 @@ class EngineContext:
         """Return what the residual's render of this view is compared with.
 
         In large pictures, only where something changed: rows reach half as many tiles more, which cost a sixth of the
-        time of a residual and are worth no decibels (docs/results/extremes.md).
+        time of a residual, and only keep from wearing away over many frames what stands still
+        (docs/results/extremes.md).
         """
         return self.changed_target(view) if is_large(self.cameras.width) else self.view_target(view)
 

@@ -33,10 +33,14 @@ def removal_errors(
 ) -> tuple[torch.Tensor, float]:
     """Return the squared change of the images if each Gaussian alone is removed, and their error with all of them.
 
-    It is estimated from so many ``probes`` of every camera.
-
     Returns [N] float64, the squared change of all channels of all pixels together, and the mean squared error of a
     channel of a pixel.
+
+    Arguments:
+        views: training images.
+        gaussians: [N] raw values.
+        generator: of the random signs.
+        probes: images of random signs for each camera, at least 1; the estimate is their mean.
     """
     rows = replace(gaussians, opacities=gaussians.opacities.clamp(max=MAX_LOGIT))
     squares = torch.zeros_like(rows.opacities, dtype=torch.float64)

@@ -33,7 +33,7 @@ class ExampleConfidence(ConfidenceEstimator):
     def estimate(self, context: FrameContext) -> torch.Tensor:
         total = torch.zeros_like(context.gaussians.opacities, dtype=torch.float64)
         for view in range(len(context.cameras)):
-            change = context.previous_image(view) - context.image(view)
+            change = context.image_change(view)
             check_finite(f"change of view {view}", change)
             gradient, visible = context.screen_gradient(view, change)
             total += gradient.double().norm(dim=1) * visible

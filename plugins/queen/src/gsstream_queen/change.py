@@ -42,11 +42,12 @@ def gradient_difference(work: FrameTools, settings: ChangeSettings) -> Change:
 
 def _upstream(work: FrameTools, view: int, settings: ChangeSettings) -> torch.Tensor:
     """[H, W, 3] derivative of E_t - E_{t-1} with respect to the render of frame t-1."""
+    if settings.loss == "mse":  # the render itself cancels
+        change = work.image_change(view)
+        return -2 * change / change.numel()
     now, before = work.image(view), work.previous_image(view)
     if torch.equal(now, before):
         return torch.zeros_like(now)
-    if settings.loss == "mse":  # the render itself cancels
-        return 2 * (before - now) / now.numel()
     shown = work.previous_render(view)
     return (_direction(shown, now) - _direction(shown, before)) / (now.shape[0] * now.shape[1])
 

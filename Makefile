@@ -46,7 +46,7 @@ check: PYTEST_ARGS := -m "quick and not slow"
 test check: setup
 	@status=0; \
 	$(BIN)/mypy > $(VENV)/mypy.log 2>&1 & types=$$!; trap "kill $$types" INT TERM; \
-	for check in "ruff check ." "lint-imports"; do \
+	for check in "ruff check ." "ruff format --check --quiet ." "lint-imports"; do \
 	  echo "== $$check"; $(BIN)/$$check || { echo "== FAILED: $$check"; status=1; }; \
 	done; \
 	echo "== pytest"; $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS) || status=1; \

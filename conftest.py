@@ -29,7 +29,7 @@ LONG = (
     "flow/test_closed_loop", "flow/test_repeat_and_resume", "flow/test_resume", "flow/test_key_refresh",
     "lab/tests/test_sweep_real",
     "cpu_render/tests/test_cross_aarch64", "contract/test_new_plugin", "contract/test_howtos",
-    "plugins/test_six_rings", "lab/tests/test_paper_configs", "web/test_page", "flow/test_budget",
+    "discovery/test_six_rings", "lab/tests/test_paper_configs", "web/test_page", "flow/test_budget",
     "contract/test_saboteurs", "contract/test_shipped_plugins", "flow/test_no_overshoot", "web/test_live_page",
     "flow/test_odd_runs", "web/test_decoder", "input/prepare/test_prepare",
     "flow/test_cost_follows_change", "flow/test_bad_input",
@@ -42,7 +42,7 @@ LONG = (
 #: What ``make check`` runs: rooms whose tests are cheap, and the one test of whole runs that must never fail.
 QUICK = (
     "core", "recipe", "parts/update", "parts/render", "metrics", "cli", "packet", "packet/lies", "player", "method",
-    "plugins", "parts/motion",
+    "discovery", "parts/motion",
 )  # fmt: skip
 #: Of other rooms what the work of these days leans on: budgets, assembling, what is chosen by numbers, the renderer.
 QUICK_FILES = (
@@ -53,8 +53,9 @@ QUICK_FILES = (
 #: Too slow for that in these rooms.
 NOT_QUICK = (
     "packet/test_fuzz", "packet/test_corrupt", "packet/test_row_edits",
-    "packet/test_motion_packets", "player/test_player_memory", "plugins/test_six_rings", "plugins/test_broken_plugins",
-    "method/test_whole_method", "recipe/test_recipe_schema", "recipe/test_recipe_typos",
+    "packet/test_motion_packets", "player/test_player_memory", "discovery/test_six_rings",
+    "discovery/test_broken_plugins", "method/test_whole_method", "recipe/test_recipe_schema",
+    "recipe/test_recipe_typos",
 )  # fmt: skip
 
 

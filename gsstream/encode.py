@@ -31,6 +31,7 @@ from gsstream.core.cameras import Cameras as Cameras
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame as Frame
 from gsstream.core.world import rig_similarity, snap_cameras
+from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.assembly.assemble import Assembly as Assembly
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.frame0.points import gather_points
@@ -52,7 +53,6 @@ from gsstream.parts.regularizer.base import Regularizer
 from gsstream.parts.render.base import Renderer
 from gsstream.parts.structure.base import Structure
 from gsstream.parts.update.base import UpdateRule
-from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe as Recipe
 
@@ -125,9 +125,12 @@ def to_rig_coordinates(source: FrameSource) -> FrameSource:
 
 
 def encoder_for(
-    method: str, source: FrameSource, settings: Mapping[str, Any] | None = None, listeners: Callbacks | None = None,
+    method: str,
+    source: FrameSource,
+    settings: Mapping[str, Any] | None = None,
+    listeners: Callbacks | None = None,
     **parts: Unpack[Parts],
-) -> Encoder:  # fmt: skip
+) -> Encoder:
     """Return an encoder of a recording, before its frame 0.
 
     Arguments:
@@ -149,9 +152,14 @@ def encoder_for(
 
 
 def encoder_for_rig(
-    method: str, cameras: Cameras, *, fps: float = 30.0, settings: Mapping[str, Any] | None = None, name: str = "rig",
+    method: str,
+    cameras: Cameras,
+    *,
+    fps: float = 30.0,
+    settings: Mapping[str, Any] | None = None,
+    name: str = "rig",
     **parts: Unpack[Parts],
-) -> Encoder:  # fmt: skip
+) -> Encoder:
     """Return an encoder of images that come from anywhere; frame 0 is seeded by a plane sweep over them.
 
     The stream lies in coordinates that the rig defines: cameras of frames are taken there by

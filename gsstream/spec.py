@@ -33,6 +33,7 @@ __all__ = [
 def __dir__() -> list[str]:
     return __all__
 
+
 ENTRY_POINT_GROUP = "gsstream"
 if TYPE_CHECKING:
     Kind = str

@@ -7,14 +7,14 @@ from contextlib import contextmanager
 
 import pytest
 
-from gsstream.engine.fit import schedule
+from gsstream.engine.fit import constants
 
 
 @contextmanager
-def densifying(begin: int, every: int, gradient: float = schedule.DENSIFY_GRADIENT) -> Iterator[None]:
+def densifying(begin: int, every: int, gradient: float = constants.DENSIFY_GRADIENT) -> Iterator[None]:
     """In this process Gaussians are added from this iteration of frame 0 on, once in so many."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(schedule, "DENSIFY_FROM", begin)
-        patch.setattr(schedule, "DENSIFY_EVERY", every)
-        patch.setattr(schedule, "DENSIFY_GRADIENT", gradient)
+        patch.setattr(constants, "DENSIFY_FROM", begin)
+        patch.setattr(constants, "DENSIFY_EVERY", every)
+        patch.setattr(constants, "DENSIFY_GRADIENT", gradient)
         yield

@@ -125,8 +125,13 @@ def apply(field, means: list[list[float]], quats: list[list[float]]) -> tuple[li
         s = 1 / math.sqrt(1 + x * x + y * y + z * z)
         w0, x0, y0, z0 = s, x * s, y * s, z * s
         w1, x1, y1, z1 = quats[row]
-        quats[row] = [f32(value) for value in (
-            w0 * w1 - x0 * x1 - y0 * y1 - z0 * z1, w0 * x1 + x0 * w1 + y0 * z1 - z0 * y1,
-            w0 * y1 - x0 * z1 + y0 * w1 + z0 * x1, w0 * z1 + x0 * y1 - y0 * x1 + z0 * w1,
-        )]  # fmt: skip
+        quats[row] = [
+            f32(value)
+            for value in (
+                w0 * w1 - x0 * x1 - y0 * y1 - z0 * z1,
+                w0 * x1 + x0 * w1 + y0 * z1 - z0 * y1,
+                w0 * y1 - x0 * z1 + y0 * w1 + z0 * x1,
+                w0 * z1 + x0 * y1 - y0 * x1 + z0 * w1,
+            )
+        ]
     return means, quats

@@ -32,9 +32,14 @@ class Forked:
     """
 
     def __init__(
-        self, args: Sequence[str], *, path: Sequence[str] = (), cwd: Path | None = None,
-        env: Mapping[str, str] | None = None, first: str = "",
-    ) -> None:  # fmt: skip
+        self,
+        args: Sequence[str],
+        *,
+        path: Sequence[str] = (),
+        cwd: Path | None = None,
+        env: Mapping[str, str] | None = None,
+        first: str = "",
+    ) -> None:
         self.args, self._folder = args, Path(tempfile.mkdtemp())
         self._outputs = [self._folder / name for name in ("out", "err")]
         surroundings = list(path), str(cwd or Path.cwd()), dict(env or os.environ)

@@ -73,9 +73,12 @@ def apply_residual(
 
 
 def decode_rows(
-    rule: UpdateRule, base: Gaussians[torch.Tensor], latents: Mapping[str, torch.Tensor],
-    decoders: Mapping[str, torch.Tensor], units: torch.Tensor,
-) -> tuple[JointLayout, JointResidual]:  # fmt: skip
+    rule: UpdateRule,
+    base: Gaussians[torch.Tensor],
+    latents: Mapping[str, torch.Tensor],
+    decoders: Mapping[str, torch.Tensor],
+    units: torch.Tensor,
+) -> tuple[JointLayout, JointResidual]:
     """The joint table of these latents and what they decode to, as the engine computes it while it trains."""
     code = joint_layout(rule.codes(), latents, decoders, base)
     table = torch.cat(list(latents.values()), 1)
@@ -83,9 +86,13 @@ def decode_rows(
 
 
 def train_rows(
-    rule: UpdateRule, base: Gaussians[torch.Tensor], gates: torch.Tensor, latents: Mapping[str, torch.Tensor],
-    decoders: Mapping[str, torch.Tensor], units: torch.Tensor,
-) -> Gaussians[torch.Tensor]:  # fmt: skip
+    rule: UpdateRule,
+    base: Gaussians[torch.Tensor],
+    gates: torch.Tensor,
+    latents: Mapping[str, torch.Tensor],
+    decoders: Mapping[str, torch.Tensor],
+    units: torch.Tensor,
+) -> Gaussians[torch.Tensor]:
     """The changed rows as the engine computes them while it trains; arguments of :func:`apply_residual`."""
     code, change = decode_rows(rule, base, latents, decoders, units)
     return add_joint(code, base, join_features(code, base), change, gates)

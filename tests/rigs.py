@@ -13,8 +13,13 @@ WIDTH, HEIGHT, FOCAL = 64, 48, 50.0
 
 
 def looking(
-    centers: ArrayLike, targets: ArrayLike, up: Sequence[float] = (0.0, 0.0, 1.0), K: ArrayLike | None = None,
-    size: tuple[int, int] = (WIDTH, HEIGHT), near: float = 0.01, names: tuple[str, ...] | None = None,
+    centers: ArrayLike,
+    targets: ArrayLike,
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+    K: ArrayLike | None = None,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+    near: float = 0.01,
+    names: tuple[str, ...] | None = None,
 ) -> Cameras:
     """Cameras held level at these places, each looking at its target; one that looks along ``up`` has x to its right.
 
@@ -30,7 +35,7 @@ def looking(
         pose[:3, 3] = -pose[:3, :3] @ center
     Ks = np.asarray([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]] if K is None else K, np.float64)
     names = names or tuple(f"cam{i}" for i in range(len(centers)))
-    return Cameras(names, viewmats, np.tile(Ks, (len(centers), 1, 1)), *size, near)  # fmt: skip
+    return Cameras(names, viewmats, np.tile(Ks, (len(centers), 1, 1)), *size, near)
 
 
 def on_arc(count: int, degrees: float, radius: float = 3.0, height: float = 0.6) -> list[list[float]]:

@@ -38,10 +38,13 @@ def scene_at(means: np.ndarray, moved: Displacement | None = None, quats: np.nda
     """Gaussians of one size in given places, every one a root; not turned unless ``quats`` say so."""
     number = len(means)
     gaussians = Gaussians(
-        means=means.astype(np.float32), quats=np.tile(np.float32([1, 0, 0, 0]), (number, 1)),
-        scales=np.zeros((number, 3), np.float32), opacities=np.zeros(number, np.float32),
-        sh0=np.zeros((number, 1, 3), np.float32), shN=np.zeros((number, 0, 3), np.float32),
-    )  # fmt: skip
+        means=means.astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (number, 1)),
+        scales=np.zeros((number, 3), np.float32),
+        opacities=np.zeros(number, np.float32),
+        sh0=np.zeros((number, 1, 3), np.float32),
+        shN=np.zeros((number, 0, 3), np.float32),
+    )
     if quats is not None:
         gaussians.quats[:] = quats
     return Scene(gaussians, Layout.flat(number, 1.0), moved)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import io
 import subprocess
 import sys
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,17 +19,11 @@ from tools.reference.text import NOTE
 ROOT = Path(__file__).parents[1]
 FOLDERS = [ROOT / "gsstream", ROOT / "tools", *sorted((ROOT / "plugins").glob("*/src"))]
 LIBRARY = sorted(path for folder in FOLDERS for path in folder.rglob("*.py"))
-MAX_FILE, MAX_FUNCTION = 300, 60
+#: Lines of code, without docstrings, comments and blank lines; and all lines of a function.
+MAX_FILE, MAX_FUNCTION = 240, 60
 
 #: What must import without torch: listing parts stays cheap, and the player runs where there is no torch.
-TORCH_FREE = tuple(f"gsstream.{room}" for room in ("spec", "plugins", "recipe", "player", "packet", "serve", "core"))
-
-
-def test_import_contracts() -> None:
-    command = [sys.executable, "-c", "from importlinter.cli import lint_imports_command as main; main()", "--no-cache"]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
-    assert result.returncode == 0, result.stdout + result.stderr
-    assert " 0 broken" in result.stdout
+TORCH_FREE = tuple(f"gsstream.{room}" for room in ("spec", "discovery", "recipe", "player", "packet", "serve", "core"))
 
 
 def modules_below(names: tuple[str, ...]) -> list[str]:
@@ -58,9 +54,28 @@ def test_these_rooms_import_no_torch() -> None:
     assert len(names) > 30
 
 
+def code_lines(source: str) -> int:
+    """Count the lines that hold code: no docstring, no comment, not blank."""
+    docstrings: set[int] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            first = node.body[0] if node.body else None
+            if ast.get_docstring(node) is not None and first is not None:
+                docstrings.update(range(first.lineno, (first.end_lineno or first.lineno) + 1))
+    silent = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    found = {line for t in tokens if t.type not in silent for line in range(t.start[0], t.end[0] + 1)}
+    return len(found - docstrings)
+
+
+def test_code_lines_are_counted_as_a_reader_would() -> None:
+    source = '"""Module."""\n# comment\n\ndef f():\n    """Doc\n    string."""\n    return (  # why\n        1)\n'
+    assert code_lines(source) == 3
+
+
 def test_files_are_short() -> None:
     assert len(LIBRARY) > 100, "the sources were not found"
-    lengths = {str(path.relative_to(ROOT)): len(path.read_text(encoding="utf-8").splitlines()) for path in LIBRARY}
+    lengths = {str(path.relative_to(ROOT)): code_lines(path.read_text(encoding="utf-8")) for path in LIBRARY}
     assert not {name: length for name, length in lengths.items() if length > MAX_FILE}
 
 
@@ -107,7 +122,7 @@ def settings(model: type[BaseModel], name: str):
 
 def test_every_setting_is_described(monkeypatch: pytest.MonkeyPatch) -> None:
     from gsstream.core.kinds import CONTRACTS
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.recipe.model import Recipe
 
     monkeypatch.setenv("GSSTREAM_LOAD_PLUGINS", "")

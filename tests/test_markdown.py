@@ -21,7 +21,7 @@ from pydantic import BaseModel
 from gsstream.cli.main import app
 from gsstream.cli.table import whole_table
 from gsstream.core.kinds import CONTRACTS
-from gsstream.plugins.catalog import load_catalog
+from gsstream.discovery.catalog import load_catalog
 from gsstream.recipe.model import Recipe
 from tools.reference.pages import BUILT, FOLDER
 
@@ -357,9 +357,13 @@ def messages(path: Path) -> Iterator[str]:
 
 def test_commands_that_messages_name_parse() -> None:
     calls = {
-        call for root in ("gsstream", "plugins") for path in ROOT.glob(f"{root}/**/*.py")
+        call
+        for root in ("gsstream", "plugins")
+        for path in ROOT.glob(f"{root}/**/*.py")
         if "tests" not in path.relative_to(ROOT).parts
-        for text in messages(path) for call in CALL.findall(text) if call.split()[1] not in VERBS
-    }  # fmt: skip
+        for text in messages(path)
+        for call in CALL.findall(text)
+        if call.split()[1] not in VERBS
+    }
     assert len(calls) > 12
     check(sorted(f"{call}: {said}" for call in calls if (said := problem(shlex.split(call)[1:], complete=False))))

@@ -113,14 +113,21 @@ def drill(finished: Path, out: Path, fps: float, frames: int, watch: str, option
     others = None if machine is None or machine_now is None else max(0.0, machine_now - machine - used) / seconds
     lines = read_lines(out / "run" / METRICS)
     return {
-        "fps": fps, "watch": watch, "options": list(options), **reported(lines), **evaluated(out, len(lines)),
+        "fps": fps,
+        "watch": watch,
+        "options": list(options),
+        **reported(lines),
+        **evaluated(out, len(lines)),
         "capture_late_s": capture.late,
         "machine": {
-            "processors": os.cpu_count(), "load_before": load, "load_after": os.getloadavg()[0],
-            "used_by_the_run": used / seconds, "used_by_others": others,
+            "processors": os.cpu_count(),
+            "load_before": load,
+            "load_after": os.getloadavg()[0],
+            "used_by_the_run": used / seconds,
+            "used_by_others": others,
         },
         "said": latency_lines(lines),
-    }  # fmt: skip
+    }
 
 
 def reported(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -109,14 +109,22 @@ class Bench:
         now.write_text("", encoding="utf-8")
         places = [self.helpers, self.copy, *sorted(self.copy.glob("plugins/*/src"))]
         environment = {
-            **os.environ, "PYTHONPATH": os.pathsep.join(map(str, places)), "PYTHONDONTWRITEBYTECODE": "1",
-            "GSSTREAM_MUTATE_NOW": str(now), "CI": "1",
-        }  # fmt: skip
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(map(str, places)),
+            "PYTHONDONTWRITEBYTECODE": "1",
+            "GSSTREAM_MUTATE_NOW": str(now),
+            "CI": "1",
+        }
         command = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "not slow", "-p", "mutate_order", *tests]
         child = subprocess.Popen(
-            command, cwd=self.copy, env=environment, start_new_session=True, text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        )  # fmt: skip
+            command,
+            cwd=self.copy,
+            env=environment,
+            start_new_session=True,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
         try:
             output, _ = child.communicate(timeout=max(limit, 0))
         except subprocess.TimeoutExpired:

@@ -112,11 +112,14 @@ def compare(options: argparse.Namespace, method: str, name: str, world: World, f
             found[side].append(numbers(runs[side], first is None))
     old, new = ({key: min(row[key] for row in found[side]) for key in found[side][0]} for side in found)
     return {
-        "world": name, "method": label, "difference": first_difference(runs["before"], runs["after"]),
-        "psnr": [round(old["psnr"], 3), round(new["psnr"], 3)], "kb": [round(old["kb"], 3), round(new["kb"], 3)],
+        "world": name,
+        "method": label,
+        "difference": first_difference(runs["before"], runs["after"]),
+        "psnr": [round(old["psnr"], 3), round(new["psnr"], 3)],
+        "kb": [round(old["kb"], 3), round(new["kb"], 3)],
         "seconds": [round(old["seconds"], 3), round(new["seconds"], 3)],
         "time_ratio": round(new["seconds"] / old["seconds"], 3),
-    }  # fmt: skip
+    }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

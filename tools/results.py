@@ -82,8 +82,18 @@ def rows_of_sweep(folder: Path, commit: str, at: Sequence[int] = ()) -> list[Row
             origin = {"commit": commit, "recipe": run.row["recipe"], "date": run.row["date"]}
             machine = {"processor": facts["processor"], "processors": facts["processors_usable"]}
             frames = len(run.row["frames"])
-            rows.append({"scene": group.scene, "name": group.label, "seed": run.seed, "frames": frames, **values,
-                         **_phases(run), **origin, **machine})  # fmt: skip
+            rows.append(
+                {
+                    "scene": group.scene,
+                    "name": group.label,
+                    "seed": run.seed,
+                    "frames": frames,
+                    **values,
+                    **_phases(run),
+                    **origin,
+                    **machine,
+                }
+            )
     return rows
 
 

@@ -11,7 +11,7 @@ import typer
 from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
 
 if TYPE_CHECKING:
-    from gsstream.plugins.catalog import Catalog
+    from gsstream.discovery.catalog import Catalog
     from gsstream.testing.kit import CheckResult
 
 MARKS = {"passed": "✓", "failed": "✗", "warning": "⚠", "expected failure": "⚠", "skipped": "⚠"}
@@ -44,7 +44,7 @@ def check(
 
     Exit code 1 when it does not.
     """
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.testing.kit import summary
 
     subjects = []
@@ -64,8 +64,7 @@ def check(
 
 
 def _lines(subject: Subject, quiet: bool) -> Iterator[str]:
-    """One line for each check, and one for all that have the same reason; what passed or was not claimed not if quiet.
-    """
+    """Yield a line per check; checks of one reason share one; ``quiet`` leaves out what passed or is not claimed."""
     if subject.absent:
         yield _line(subject.results[0], "every check")
         return

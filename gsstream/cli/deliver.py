@@ -28,7 +28,8 @@ def export(
     rendition: Annotated[
         list[Path] | None,
         typer.Option(
-            "--rendition", metavar="RUN",
+            "--rendition",
+            metavar="RUN",
             help="Of a page: another run of the recording that viewers may choose; repeat it.",
         ),
     ] = None,
@@ -78,7 +79,9 @@ def _page(stream: Path, out: Path, renditions: list[Path], join_every: float) ->
         f"{plural(done.joins, 'join')}, {done.join_bytes / 1e6:.2f} MB, "
         f"and the player, {done.player_bytes / 1e3:.0f} KB"
     )
-    typer.echo(f"look at it: python -m http.server --directory {done.folder} --bind 127.0.0.1 8000, http://127.0.0.1:8000")
+    typer.echo(
+        f"look at it: python -m http.server --directory {done.folder} --bind 127.0.0.1 8000, http://127.0.0.1:8000"
+    )
 
 
 def _manifest(stream: Path, out: Path) -> Path:

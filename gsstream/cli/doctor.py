@@ -21,7 +21,7 @@ import typer
 from gsstream import API_VERSION, __version__
 from gsstream.cli.listing import plural, printable
 from gsstream.core.errors import GsstreamError
-from gsstream.core.needs import install_extra
+from gsstream.core.install_hints import install_extra
 from gsstream.core.processors import processors
 
 if TYPE_CHECKING:
@@ -114,8 +114,8 @@ def _torch() -> str:
 def _encoder() -> str:
     if "torch" not in sys.modules:
         return "nothing: torch is missing"
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.engine.assembly.choose_renderer import SlowRendererWarning, choose_renderer
-    from gsstream.plugins.catalog import load_catalog
 
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", SlowRendererWarning)
@@ -148,7 +148,7 @@ def _gpu() -> str:
 
 
 def _plugins() -> str:
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.discovery.catalog import load_catalog
 
     catalog = load_catalog()
     broken = [f"{plugin.name} ({plugin.reason})" for plugin in catalog.quarantine]

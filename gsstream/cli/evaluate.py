@@ -97,7 +97,8 @@ def evaluate(
     protocol: Annotated[
         str | None,
         typer.Option(
-            "--protocol", metavar="panoptic-sports|n3dv|meetroom",
+            "--protocol",
+            metavar="panoptic-sports|n3dv|meetroom",
             help="Refuse what a published protocol does not admit, and add the numbers that it reports.",
         ),
     ] = None,
@@ -150,10 +151,10 @@ def _lpips(file: Path | None, lower: str | None) -> OnnxLpips | None:
 def _of_stream(
     stream: Path, source: str | None, asked: Asked, most: int | None
 ) -> tuple[Evaluation, PacketError | None]:
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.engine.run.recording import reopen_recording
     from gsstream.evaluation.evaluate import evaluate as evaluate_stream
     from gsstream.player.playback import Playback
-    from gsstream.plugins.catalog import load_catalog
 
     file = stream_file(stream)
     with Playback(file, max_memory=most) as playback:
@@ -175,14 +176,12 @@ def _of_stream(
         recording.close()
 
 
-def _of_files(
-    other: Elsewhere, source: str, asked: Asked
-) -> tuple[Evaluation, str]:
+def _of_files(other: Elsewhere, source: str, asked: Asked) -> tuple[Evaluation, str]:
     """The evaluation of a folder, and a line that says what its files take."""
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.engine.run.recording import open_recording
     from gsstream.evaluation.evaluate import evaluate_frames
     from gsstream.evaluation.offline import PlySequence, Renders, bytes_line
-    from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
 
     catalog = load_catalog()

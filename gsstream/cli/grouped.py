@@ -36,8 +36,10 @@ def _options(parameter: inspect.Parameter, hint: Any) -> list[inspect.Parameter]
     hints = get_type_hints(hint, include_extras=True)
     return [
         inspect.Parameter(
-            one.name, inspect.Parameter.KEYWORD_ONLY, annotation=hints[one.name],
+            one.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            annotation=hints[one.name],
             default=inspect.Parameter.empty if one.default is MISSING else one.default,
         )
         for one in fields(hint)
-    ]  # fmt: skip
+    ]

@@ -86,9 +86,12 @@ def _lines(found: dict[str, float | None]) -> list[tuple[str, str]]:
         ),
         (
             "coder",
-            of("deltas {:.3f} and keys {:.3f} times the entropy of their symbols", "delta_coder_over_entropy",
-               "key_coder_over_entropy"),
+            of(
+                "deltas {:.3f} and keys {:.3f} times the entropy of their symbols",
+                "delta_coder_over_entropy",
+                "key_coder_over_entropy",
+            ),
         ),
         ("", of("deltas {:.2f} times smaller than float16 and zstd-19", "float16_zstd_over_coded")),
         ("decoding", of("{:.2f} ms a delta (median; most {:.2f})", "delta_decode_ms_median", "delta_decode_ms_most")),
-    ]  # fmt: skip
+    ]

@@ -16,7 +16,7 @@ from gsstream import API_VERSION, __version__
 from gsstream.cli.listing import printable
 from gsstream.cli.table import CommandTable
 from gsstream.core.errors import GsstreamError, InputError
-from gsstream.core.needs import missing_for_encoding
+from gsstream.core.install_hints import missing_for_encoding
 
 #: Exit codes of runs that a service ended: 128 plus the number of the signal.
 _SIGNALS = {129: "SIGHUP", 143: "SIGTERM"}

@@ -12,7 +12,7 @@ from gsstream.core.errors import InputError
 from gsstream.core.kinds import METHOD_SLOTS
 
 if TYPE_CHECKING:
-    from gsstream.plugins.catalog import Catalog
+    from gsstream.discovery.catalog import Catalog
     from gsstream.recipe.load import ResolvedRecipe
 
 
@@ -28,7 +28,7 @@ def methods(
         return
     if full:
         raise InputError("--full: expected a method to show in full, e.g. gsstream methods dense --full")
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.discovery.catalog import load_catalog
 
     catalog = load_catalog()
     entries = [catalog.entry("method", name) for name in catalog.names("method")]
@@ -39,7 +39,7 @@ def methods(
 
 
 def _show(name: str, full: bool) -> None:
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
 
     catalog = load_catalog()

@@ -20,9 +20,7 @@ Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change a value, e.g. gate.temperature=0.3; repeatable."),
 ]
-BUDGET = typer.Option(
-    "--budget", metavar="LIMITS", help="Any of time=1.0s,size=20KB,rate=2Mbit/s,memory=2GB."
-)
+BUDGET = typer.Option("--budget", metavar="LIMITS", help="Any of time=1.0s,size=20KB,rate=2Mbit/s,memory=2GB.")
 Scale = Annotated[float | None, typer.Option("--scale", help="Shrink images by this factor in (0, 1].")]
 FirstFrame = Annotated[
     Path | None, typer.Option("--first-frame", help="Take frame 0 over from this stream, do not reconstruct it.")
@@ -50,7 +48,7 @@ class RecipeOptions:
         """Return the changes as (option, KEY.PATH=VALUE), the short options last."""
         return overrides(
             self.settings, budget=self.budget, frames=self.frames, scale=self.scale, renderer=self.renderer
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True)
@@ -68,9 +66,7 @@ class ShownOptions:
         return {"pictures": not self.no_pictures, "video": not self.no_video}
 
 
-def overrides(
-    settings: Sequence[str] | None, *, budget: str | None = None, **short: object
-) -> list[tuple[str, str]]:
+def overrides(settings: Sequence[str] | None, *, budget: str | None = None, **short: object) -> list[tuple[str, str]]:
     """Return what a command line changes in a recipe: (option, KEY.PATH=VALUE), the short options last.
 
     ``short``: recipe key -> value of an option of that name; None: not given.

@@ -13,7 +13,7 @@ from gsstream.core.errors import GsstreamError, PluginUnavailable, UnknownName
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from gsstream.plugins.catalog import Catalog, Entry
+    from gsstream.discovery.catalog import Catalog, Entry
 
 
 def plugins(
@@ -29,7 +29,7 @@ def plugins(
     if part is not None:
         _show(part)
         return
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.spec import KINDS
 
     catalog = load_catalog()
@@ -43,7 +43,7 @@ def plugins(
 
 
 def _plugin_rows(catalog: Catalog) -> Iterator[tuple[str, str, str]]:
-    from gsstream.plugins.discovery import spec_key
+    from gsstream.discovery.discovery import spec_key
 
     for plugin in catalog.plugins:
         if plugin.specs is None:
@@ -76,7 +76,7 @@ def _check(catalog: Catalog) -> bool:
 
 
 def _show(part: str) -> None:
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.spec import KINDS
 
     catalog = load_catalog()
@@ -159,7 +159,7 @@ _BOUNDS = (("minimum", ">="), ("exclusiveMinimum", ">"), ("maximum", "<="), ("ex
 
 
 def _type(field: dict[str, Any]) -> str:
-    """"number > 0, <= 1" or "one of a, b"."""
+    """ "number > 0, <= 1" or "one of a, b"."""
     if "const" in field:
         return repr(field["const"])
     if "anyOf" in field:

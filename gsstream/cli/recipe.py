@@ -10,7 +10,7 @@ from gsstream.cli import options
 from gsstream.core.errors import InputError, PluginUnavailable
 
 if TYPE_CHECKING:
-    from gsstream.plugins.catalog import Catalog
+    from gsstream.discovery.catalog import Catalog
     from gsstream.recipe.schema import PartSchema
 
 
@@ -32,7 +32,7 @@ def recipe(
     With --schema: keys, ranges, meanings, and the settings of every installed part. An editor with a YAML language
     server uses a file with it when the first line of a recipe says "# yaml-language-server: $schema=FILE".
     """
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
     from gsstream.recipe.save import to_yaml
 

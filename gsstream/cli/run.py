@@ -21,9 +21,9 @@ from gsstream.cli.working import working
 from gsstream.core.errors import ComponentError, GsstreamError, OutputError, RecipeError, SourceError
 
 if TYPE_CHECKING:
+    from gsstream.discovery.catalog import Catalog
     from gsstream.engine.run.session import RunResult
     from gsstream.input.recordings.base import FrameSource, SourceInfo
-    from gsstream.plugins.catalog import Catalog
     from gsstream.recipe.model import Recipe
 
 #: Methods that are recommended where none is named, best first.
@@ -51,9 +51,9 @@ def run(
     The recipe is the method's, changed by --recipe FILE, then --set and the short options. Ctrl-C (exit code 130) and
     SIGTERM (143) end after the current frame, before frame 0 is written at once; --resume goes on to the same bytes.
     """
-    from gsstream.core.needs import require_encoder
+    from gsstream.core.install_hints import require_encoder
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.engine.run.output import claim_output, disk_errors, ended_by_signals
-    from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
 
     require_encoder()
@@ -61,7 +61,7 @@ def run(
     resolved = resolve_recipe(recipe.method, catalog.recipe_path, recipe.recipe or (), recipe.overrides())
     server, wanted, quiet = server_beside(out, serve), shown.wanted(), shown.quiet
     say, named = _silent if quiet else _note, bool(recipe.method or recipe.recipe)
-    with working("loading the method", quiet) as signs:
+    with working("loading the method", quiet) as display:
         # The slow imports come last: a mistake on the command line is answered at once.
         from gsstream.engine.assembly.assemble import assemble
         from gsstream.engine.run.recording import open_recording, read_first_frame
@@ -70,7 +70,7 @@ def run(
         assembly = assemble(resolved, catalog)
         # Read before the folder is touched: --overwrite must not delete a run for the sake of a faulty recording.
         first = None if first_frame is None else read_first_frame(stream_file(first_frame))
-        signs.tell("opening the recording")
+        display.tell("opening the recording")
         recording = open_recording(source, assembly.recipe, catalog)
     try:
         say(assembly.note)
@@ -165,9 +165,7 @@ def _what_there_is(
     )
 
 
-def _pictures(
-    result: RunResult, recording: FrameSource, wanted: Mapping[str, bool], quiet: bool, warned: bool
-) -> None:
+def _pictures(result: RunResult, recording: FrameSource, wanted: Mapping[str, bool], quiet: bool, warned: bool) -> None:
     """Contact sheet, plots, summary and video; ``warned``: the run has said that nothing fast renders here."""
     from gsstream.evaluation.gallery import SUMMARY, write_gallery
     from gsstream.player.render import SlowRendererWarning

@@ -11,8 +11,8 @@ import typer
 
 import gsstream
 from gsstream.core.errors import InputError, OutputError, UnknownName
+from gsstream.core.install_hints import pip
 from gsstream.core.kinds import PART_KINDS
-from gsstream.core.needs import pip
 
 #: Kinds that a plugin can start from.
 STARTABLE = tuple(name for name, kind in PART_KINDS.items() if kind.use is not None)
@@ -26,7 +26,7 @@ def new_plugin(
     out: Annotated[Path | None, typer.Option("--out", help="Folder to write; by default gsstream-NAME.")] = None,
 ) -> None:
     """Write a distribution with one working part, its test and README."""
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.discovery.catalog import load_catalog
 
     if not re.fullmatch(r"[a-z][a-z0-9_-]*", name):
         raise InputError(f"plugin name: expected lower case letters, digits, - and _, a letter first; got {name!r}")
@@ -180,12 +180,12 @@ method: <name>
 streaming_method: {name: <name>}
 """,
     PLUGIN: TEMPLATES[PLUGIN].replace("ComponentSpec,", "ComponentSpec, MethodSpec,")
-    + '''
+    + """
 
 @hookimpl
 def gsstream_methods() -> list[MethodSpec]:
     return [MethodSpec(name="<name>", recipe="<package>:recipes/<name>.yaml", summary="<summary>")]
-''',
+""",
     "tests/test_<package>_method.py": '''\
 """The method keeps the contract of whole methods."""
 

@@ -10,7 +10,7 @@ import typer
 from gsstream.cli import options
 from gsstream.cli.working import working
 from gsstream.core.errors import InputError
-from gsstream.core.needs import page
+from gsstream.core.install_hints import page
 
 app = typer.Typer(
     help="Prepare and validate scenes.", no_args_is_help=True, rich_markup_mode=None, add_completion=False
@@ -60,9 +60,9 @@ def prepare(
     began = time.perf_counter()
     model = lens.upper().replace("-", "_")
     options = PrepareOptions(tuple(test) if test else None, model, each, frames, width, fps=fps)
-    with working("reading pictures", quiet) as signs:
-        made = make(raw, out, options, lambda line: None if quiet else typer.echo(line), signs.tell)
-        signs.tell("checking the scene")
+    with working("reading pictures", quiet) as display:
+        made = make(raw, out, options, lambda line: None if quiet else typer.echo(line), display.tell)
+        display.tell("checking the scene")
         # The features have just been matched; how well they fit is in the report.
         found = find(lambda scale: open_source(str(out), scale), features=False)
         written = write_report(out, made, found, time.perf_counter() - began)
@@ -91,10 +91,10 @@ def validate(
     ] = False,
 ) -> None:
     """Say what is wrong with a scene, and what to do. Exit code 2 when a run would be wasted on it."""
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.engine.run.recording import open_recording
     from gsstream.input.prepare.findings import CHECKS
     from gsstream.input.prepare.validate import validate as find
-    from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.model import Recipe
 
     if frames < 1:

@@ -15,9 +15,9 @@ from gsstream.core.errors import InputError, PacketError
 from gsstream.core.names import child
 
 if TYPE_CHECKING:
+    from gsstream.discovery.catalog import Catalog
     from gsstream.packet import StreamMeta
     from gsstream.player.playback import Playback
-    from gsstream.plugins.catalog import Catalog
 
 Stream = Annotated[Path, typer.Argument(help="A stream (.gss), or the output folder of a run.")]
 Frames = Annotated[
@@ -72,9 +72,16 @@ def play(
     for name in cameras:
         target = out if len(cameras) == 1 else _one_of_many(out, name or "")
         played = play_stream(
-            file, target, camera=name, frames=chosen, progress=progress_on(name or "camera"), max_memory=most,
-            size=pixels, renderer=chosen_renderer, fps=fps,
-        )  # fmt: skip
+            file,
+            target,
+            camera=name,
+            frames=chosen,
+            progress=progress_on(name or "camera"),
+            max_memory=most,
+            size=pixels,
+            renderer=chosen_renderer,
+            fps=fps,
+        )
         typer.echo(f"{played.path}: {plural(played.frames, 'picture')}")
     fail_with(damage)
 

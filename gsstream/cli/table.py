@@ -9,9 +9,9 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
-from gsstream.plugins.builtin import gsstream_commands
-from gsstream.plugins.catalog import Catalog, Entry, load_catalog
-from gsstream.plugins.commands import command_of
+from gsstream.discovery.builtin import gsstream_commands
+from gsstream.discovery.catalog import Catalog, Entry, load_catalog
+from gsstream.discovery.commands import command_of
 from gsstream.spec import CommandSpec
 
 #: Headings of ``gsstream --help`` that come first, in this order; those of plugins follow.

@@ -15,9 +15,7 @@ from typing import Any
 
 #: Makes an error, which says what is wrong, into the one that is raised, which also says whose fault it is.
 Blame = Callable[[Exception], Exception]
-_PENDING: ContextVar[list[tuple[Any, Callable[[], Exception], Blame]] | None] = ContextVar(
-    "pending", default=None
-)
+_PENDING: ContextVar[list[tuple[Any, Callable[[], Exception], Blame]] | None] = ContextVar("pending", default=None)
 _BLAME: ContextVar[Callable[[], Blame]] = ContextVar("blame", default=lambda: lambda error: error)
 
 

@@ -63,8 +63,13 @@ class Gaussians(Generic[Array]):
         """Raise ShapeError if a shape disagrees, a value is not finite, or K is not a square up to 16."""
         n = len(self)
         shapes: dict[str, tuple[int | str, ...]] = {
-            "means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, "R", 3)
-        }  # fmt: skip
+            "means": (n, 3),
+            "quats": (n, 4),
+            "scales": (n, 3),
+            "opacities": (n,),
+            "sh0": (n, 1, 3),
+            "shN": (n, "R", 3),
+        }
         for name, array in self.items():
             check_shape(name, array, shapes[name])
             check_finite(name, array)

@@ -12,8 +12,12 @@ from gsstream.core.shapes import FloatArray
 _SH1 = 0.4886025119029199
 _SH2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 _SH3 = (
-    0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277,
-)  # fmt: skip
+    0.5900435899266435,
+    2.890611442640554,
+    0.4570457994644658,
+    0.3731763325901154,
+    1.445305721320277,
+)
 
 
 def sh_basis(directions: FloatArray, degree: int) -> FloatArray:
@@ -28,9 +32,14 @@ def sh_basis(directions: FloatArray, degree: int) -> FloatArray:
     if degree > 2:
         a, b, c, d, e = _SH3
         basis += [
-            -a * y * (3 * x * x - y * y), b * x * y * z, -c * y * (5 * z * z - 1), d * z * (5 * z * z - 3),
-            -c * x * (5 * z * z - 1), e * z * (x * x - y * y), -a * x * (x * x - 3 * y * y),
-        ]  # fmt: skip
+            -a * y * (3 * x * x - y * y),
+            b * x * y * z,
+            -c * y * (5 * z * z - 1),
+            d * z * (5 * z * z - 3),
+            -c * x * (5 * z * z - 1),
+            e * z * (x * x - y * y),
+            -a * x * (x * x - 3 * y * y),
+        ]
     return np.stack(basis)
 
 

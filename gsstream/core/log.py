@@ -13,8 +13,19 @@ from typing import Any, NamedTuple
 
 #: The phases of a frame, in the order in which tables list them. "failed" is time whose result was thrown away.
 PHASES = (
-    "seed", "change", "motion", "confidence", "optimise", "growth", "code", "keep", "key", "refine", "failed", "other",
-)  # fmt: skip
+    "seed",
+    "change",
+    "motion",
+    "confidence",
+    "optimise",
+    "growth",
+    "code",
+    "keep",
+    "key",
+    "refine",
+    "failed",
+    "other",
+)
 
 
 class Mark(NamedTuple):

@@ -113,8 +113,10 @@ class World:
             means=self.points(scene.means),
             quats=quat_multiply(_quaternion(self.matrix)[None], np.asarray(scene.quats, np.float64)),
             scales=np.asarray(scene.scales, np.float64) + np.log(self.scale),
-            opacities=scene.opacities, sh0=scene.sh0, shN=rotate_sh(scene.shN, self.matrix),
-        )  # fmt: skip
+            opacities=scene.opacities,
+            sh0=scene.sh0,
+            shN=rotate_sh(scene.shN, self.matrix),
+        )
 
 
 IDENTITY = World()
@@ -201,10 +203,14 @@ def _world(rotation: FloatArray, offset: FloatArray, scale: float) -> World:
 def _quaternion(rotation: FloatArray) -> FloatArray:
     """[4] wxyz of a rotation, by the largest of its four components (Shepperd)."""
     r = rotation
-    squares = np.array([
-        1 + r[0, 0] + r[1, 1] + r[2, 2], 1 + r[0, 0] - r[1, 1] - r[2, 2],
-        1 - r[0, 0] + r[1, 1] - r[2, 2], 1 - r[0, 0] - r[1, 1] + r[2, 2],
-    ])  # fmt: skip
+    squares = np.array(
+        [
+            1 + r[0, 0] + r[1, 1] + r[2, 2],
+            1 + r[0, 0] - r[1, 1] - r[2, 2],
+            1 - r[0, 0] + r[1, 1] - r[2, 2],
+            1 - r[0, 0] - r[1, 1] + r[2, 2],
+        ]
+    )
     a, b, c = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
     d, e, f = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
     rows = ((squares[0], a, b, c), (a, squares[1], d, e), (b, d, squares[2], f), (c, e, f, squares[3]))

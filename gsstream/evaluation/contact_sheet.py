@@ -34,8 +34,15 @@ _MARGIN, _GAP, _TEXT = 8, 4, 18
 CLOSER = 3
 #: Pictures of a sheet are at most so wide, pixels: large ones are reduced by a whole number.
 WIDEST = 480
-_LABELS = ("ground truth", "decoded", f"|error| x {ERROR_GAIN}", "allowed to change",
-           "ground truth, close", "decoded, close", "fresh, close")  # fmt: skip
+_LABELS = (
+    "ground truth",
+    "decoded",
+    f"|error| x {ERROR_GAIN}",
+    "allowed to change",
+    "ground truth, close",
+    "decoded, close",
+    "fresh, close",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +63,10 @@ class Column:
     def pictures(self) -> tuple[FloatArray | None, ...]:
         """The pictures of a column, in the order of ``_LABELS``."""
         error = np.abs(self.truth - np.clip(self.decoded, 0, 1)) * ERROR_GAIN
-        close = [None if self.close is None or i is None else _enlarged(i[self.close])
-                 for i in (self.truth, self.decoded, self.fresh)]  # fmt: skip
+        close = [
+            None if self.close is None or i is None else _enlarged(i[self.close])
+            for i in (self.truth, self.decoded, self.fresh)
+        ]
         return (self.truth, self.decoded, error, self.active, *close)
 
 
@@ -95,9 +104,15 @@ def contact_sheet(columns: Sequence[Column], heading: str = "") -> Image.Image:
 
 
 def sheet_of_stream(
-    stream: str | os.PathLike[str], source: FrameSource, frames: Sequence[int], out: str | os.PathLike[str], *,
-    camera: str | None = None, renderer: PlayerRenderer | None = None, fresh: Mapping[int, Path] | None = None,
-) -> Path:  # fmt: skip
+    stream: str | os.PathLike[str],
+    source: FrameSource,
+    frames: Sequence[int],
+    out: str | os.PathLike[str],
+    *,
+    camera: str | None = None,
+    renderer: PlayerRenderer | None = None,
+    fresh: Mapping[int, Path] | None = None,
+) -> Path:
     """Render a contact sheet of a stream's frames against its recording and save it as PNG.
 
     Raises InputError for an unknown camera or frame.
@@ -169,9 +184,13 @@ def paint_gates(state: PlayerState) -> Gaussians[FloatArray]:
     closed, opened = np.array(_CLOSED), np.array(_OPEN)
     color = closed + share[:, None] * (opened - closed)
     return Gaussians(
-        gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities,
-        ((color - 0.5) / SH0)[:, None].astype(np.float32), np.zeros_like(gaussians.shN),
-    )  # fmt: skip
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        ((color - 0.5) / SH0)[:, None].astype(np.float32),
+        np.zeros_like(gaussians.shN),
+    )
 
 
 def _wrapped(text: str, width: int) -> list[str]:

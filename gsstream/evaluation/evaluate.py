@@ -166,8 +166,9 @@ class StreamFrames:
         if self._last is None or self._last[0] is not scene:
             views = range(len(self.rig))
             self._last = (
-                scene, [np.clip(render(scene, self.rig, view, background, self._with), 0, 1) for view in views]
-            )  # fmt: skip
+                scene,
+                [np.clip(render(scene, self.rig, view, background, self._with), 0, 1) for view in views],
+            )
         return self._last[1]
 
     def seen(self, frame: int) -> list[BoolArray]:
@@ -179,11 +180,16 @@ class StreamFrames:
 
 
 def evaluate(
-    stream: str | os.PathLike[str], source: FrameSource, *, frames: Sequence[int] | None = None,
-    split: Literal["train", "test"] = "test", renderer: PlayerRenderer | None = None,
-    lpips: OnnxLpips | None = None, extras: Mapping[str, ViewMetric] | None = None,
+    stream: str | os.PathLike[str],
+    source: FrameSource,
+    *,
+    frames: Sequence[int] | None = None,
+    split: Literal["train", "test"] = "test",
+    renderer: PlayerRenderer | None = None,
+    lpips: OnnxLpips | None = None,
+    extras: Mapping[str, ViewMetric] | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Evaluation:  # fmt: skip
+) -> Evaluation:
     """Render a stream's packets with the player and compare every test view with the recording.
 
     Raises InputError when the recording's cameras are not those of the stream, PacketError for a damaged stream.
@@ -191,16 +197,19 @@ def evaluate(
     renderer = find_renderer() if renderer is None else renderer
     with Playback(stream) as playback:
         shown = StreamFrames(playback, playback.cameras(split), renderer)
-        return evaluate_frames(
-            shown, source, frames=frames, split=split, lpips=lpips, extras=extras, progress=progress
-        )
+        return evaluate_frames(shown, source, frames=frames, split=split, lpips=lpips, extras=extras, progress=progress)
 
 
 def evaluate_frames(
-    shown: Shown, source: FrameSource, *, frames: Sequence[int] | None = None,
-    split: Literal["train", "test"] = "test", lpips: OnnxLpips | None = None,
-    extras: Mapping[str, ViewMetric] | None = None, progress: Callable[[int, int], None] | None = None,
-) -> Evaluation:  # fmt: skip
+    shown: Shown,
+    source: FrameSource,
+    *,
+    frames: Sequence[int] | None = None,
+    split: Literal["train", "test"] = "test",
+    lpips: OnnxLpips | None = None,
+    extras: Mapping[str, ViewMetric] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Evaluation:
     """Compare pictures of every test view with the recording, clamped to [0, 1] as a screen would (3DGS).
 
     Noise is measured between the first two evaluated frames; the first is also the one that is held and that "moving"
@@ -239,10 +248,19 @@ def _compare(
     image, truth, (moving, changed) = pair.image, pair.truth, masks
     distances = () if lpips is None else (lpips(image, truth), lpips(held, truth))
     return ViewQuality(
-        frame, name, psnr(image, truth), ssim(image, truth), psnr(image, truth, moving), float(moving.mean()),
-        psnr(held, truth), ssim(held, truth), psnr(held, truth, moving), psnr(image, truth, changed),
-        psnr(held, truth, changed), *distances,
-    )  # fmt: skip
+        frame,
+        name,
+        psnr(image, truth),
+        ssim(image, truth),
+        psnr(image, truth, moving),
+        float(moving.mean()),
+        psnr(held, truth),
+        ssim(held, truth),
+        psnr(held, truth, moving),
+        psnr(image, truth, changed),
+        psnr(held, truth, changed),
+        *distances,
+    )
 
 
 def _with_seen(
@@ -251,10 +269,13 @@ def _with_seen(
     """The same with what is measured on the pixels that training cameras see."""
     image, truth = pair.image, pair.truth
     return replace(
-        quality, psnr_seen=psnr(image, truth, seen), psnr_changed_seen=psnr(image, truth, changed & seen),
-        static_psnr_seen=psnr(held, truth, seen), static_psnr_changed_seen=psnr(held, truth, changed & seen),
+        quality,
+        psnr_seen=psnr(image, truth, seen),
+        psnr_changed_seen=psnr(image, truth, changed & seen),
+        static_psnr_seen=psnr(held, truth, seen),
+        static_psnr_changed_seen=psnr(held, truth, changed & seen),
         seen_share=float(seen.mean()),
-    )  # fmt: skip
+    )
 
 
 def _truth(source: FrameSource, frame: int, split: Literal["train", "test"], order: Sequence[int]) -> FloatArray:

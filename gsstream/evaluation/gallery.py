@@ -61,8 +61,7 @@ def _write_summary(out: Path, meta: StreamMeta, records: Sequence[FrameRecord]) 
 
 
 def write_sheet(out: Path, source: FrameSource, fresh: Mapping[int, Path] = NO_FILES) -> Path:
-    """Write the contact sheet of a run: a few frames, and those that ``fresh`` has another stream for, to compare with.
-    """
+    """Write the contact sheet of a run: a few frames, and those of which ``fresh`` holds another stream."""
     from gsstream.evaluation.contact_sheet import sheet_of_stream
 
     with Playback(out / STREAM) as playback:

@@ -47,9 +47,7 @@ def numbered(folder: Path, suffixes: Sequence[str], first: int) -> dict[int, Pat
 class PlySequence:
     """A folder of 3DGS PLYs, one per frame, in the coordinates of the recording."""
 
-    def __init__(
-        self, folder: Path, info: SourceInfo, first: int, background: tuple[float, float, float]
-    ) -> None:
+    def __init__(self, folder: Path, info: SourceInfo, first: int, background: tuple[float, float, float]) -> None:
         self._files, self._info = numbered(folder, (".ply",), first), info
         self._background = _background(folder, background)
         self._with = find_renderer()

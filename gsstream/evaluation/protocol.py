@@ -26,20 +26,37 @@ class EvaluationProtocol:
     how: str  # what a recording of another size or other cameras needs
 
 
-PROTOCOLS: Mapping[str, EvaluationProtocol] = MappingProxyType({
-    "panoptic-sports": EvaluationProtocol(
-        640, 360, ("cam00", "cam10", "cam15", "cam30"), 27, 150, "Dynamic 3D Gaussians (Luiten et al. 2024)",
-        "run with --scale 1 and without data.train_views, data.train_cameras or data.test_cameras",
-    ),
-    "n3dv": EvaluationProtocol(
-        1352, 1014, ("cam00",), None, 300, "Neural 3D Video (Li et al. 2022), as 3DGStream and S2GS measure it",
-        "run with --recipe configs/recordings/n3dv.yaml",
-    ),
-    "meetroom": EvaluationProtocol(
-        1280, 720, ("cam_0",), 12, 300, "StreamRF (Li et al. 2022), as 3DGStream and S2GS measure it",
-        "run with --recipe configs/recordings/meetroom.yaml",
-    ),
-})  # fmt: skip
+PROTOCOLS: Mapping[str, EvaluationProtocol] = MappingProxyType(
+    {
+        "panoptic-sports": EvaluationProtocol(
+            640,
+            360,
+            ("cam00", "cam10", "cam15", "cam30"),
+            27,
+            150,
+            "Dynamic 3D Gaussians (Luiten et al. 2024)",
+            "run with --scale 1 and without data.train_views, data.train_cameras or data.test_cameras",
+        ),
+        "n3dv": EvaluationProtocol(
+            1352,
+            1014,
+            ("cam00",),
+            None,
+            300,
+            "Neural 3D Video (Li et al. 2022), as 3DGStream and S2GS measure it",
+            "run with --recipe configs/recordings/n3dv.yaml",
+        ),
+        "meetroom": EvaluationProtocol(
+            1280,
+            720,
+            ("cam_0",),
+            12,
+            300,
+            "StreamRF (Li et al. 2022), as 3DGStream and S2GS measure it",
+            "run with --recipe configs/recordings/meetroom.yaml",
+        ),
+    }
+)
 
 
 def find_protocol(name: str) -> EvaluationProtocol:

@@ -93,13 +93,19 @@ def record_of(data: Mapping[str, Any]) -> FrameRecord:
     memory = data.get("peak_memory_mb")
     return FrameRecord(
         frame=int(data["frame"]),
-        psnr=_numbers(data.get("psnr")), ssim=_numbers(data.get("ssim")), psnr_moving=_numbers(data.get("psnr_moving")),
-        bytes={name: int(v) for name, v in _numbers(data.get("bytes")).items()}, seconds=_numbers(data.get("seconds")),
-        sent_gaussians=int(data.get("sent_gaussians") or 0), num_gaussians=int(data.get("num_gaussians") or 0),
-        active_gates=int(data.get("active_gates") or 0), num_gates=int(data.get("num_gates") or 0),
-        peak_memory_mb=math.nan if memory is None else float(memory), psnr_changed=_numbers(data.get("psnr_changed")),
+        psnr=_numbers(data.get("psnr")),
+        ssim=_numbers(data.get("ssim")),
+        psnr_moving=_numbers(data.get("psnr_moving")),
+        bytes={name: int(v) for name, v in _numbers(data.get("bytes")).items()},
+        seconds=_numbers(data.get("seconds")),
+        sent_gaussians=int(data.get("sent_gaussians") or 0),
+        num_gaussians=int(data.get("num_gaussians") or 0),
+        active_gates=int(data.get("active_gates") or 0),
+        num_gates=int(data.get("num_gates") or 0),
+        peak_memory_mb=math.nan if memory is None else float(memory),
+        psnr_changed=_numbers(data.get("psnr_changed")),
         open_gates=tuple(int(number) for number in data.get("open_gates") or ()),
-    )  # fmt: skip
+    )
 
 
 def _numbers(table: Mapping[str, Any] | None) -> dict[str, float]:

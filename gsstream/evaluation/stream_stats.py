@@ -93,31 +93,37 @@ class StreamStats:
         deltas, keys = self.of("delta"), self.of("key")
         coded, plain = (sum(getattr(p, name) for p in deltas) for name in ("coded", "float16_zstd"))
         return {
-            "frames": len(self.packets), "gaussians": self.num_gaussians, "nodes": self.num_nodes, "fps": self.fps,
-            "key_bytes": keys[-1].size, "key_raw_over_coded": self.raw_key_bytes / keys[-1].size,
-            "kb_per_frame": self.kb_per_frame, "kb_amortised": self.kb_amortised,
+            "frames": len(self.packets),
+            "gaussians": self.num_gaussians,
+            "nodes": self.num_nodes,
+            "fps": self.fps,
+            "key_bytes": keys[-1].size,
+            "key_raw_over_coded": self.raw_key_bytes / keys[-1].size,
+            "kb_per_frame": self.kb_per_frame,
+            "kb_amortised": self.kb_amortised,
             "mbit_per_second": self.mbit_per_second,
             "paper_kb_per_frame": _mean([p.paper / 1000 for p in self.of("delta", "empty")]),
             "paper_kb_with_frame_0": _mean([p.paper / 1000 for p in self.packets]),
-            "key_coder_over_entropy": self.efficiency("key"), "delta_coder_over_entropy": self.efficiency("delta"),
+            "key_coder_over_entropy": self.efficiency("key"),
+            "delta_coder_over_entropy": self.efficiency("delta"),
             "float16_zstd_over_coded": plain / coded if coded else None,
             "sent_share": _mean([p.sent_gaussians / max(self.num_gaussians, 1) for p in self.of("delta", "empty")]),
             "delta_decode_ms_median": median(p.decode_ms for p in deltas) if deltas else None,
             "delta_decode_ms_most": max((p.decode_ms for p in deltas), default=None),
-        }  # fmt: skip
+        }
 
     def to_json(self) -> str:
         """Return summary, sections and every packet."""
         data = {
-            "summary": self.summary(), "key_sections": self.sections("key"), "delta_sections": self.sections("delta"),
+            "summary": self.summary(),
+            "key_sections": self.sections("key"),
+            "delta_sections": self.sections("delta"),
             "packets": [asdict(packet) for packet in self.packets],
-        }  # fmt: skip
+        }
         return json.dumps(data, indent=1, allow_nan=False)
 
 
-def stream_stats(
-    stream: str | os.PathLike[str], *, progress: Callable[[int, int], None] | None = None
-) -> StreamStats:
+def stream_stats(stream: str | os.PathLike[str], *, progress: Callable[[int, int], None] | None = None) -> StreamStats:
     """Decode every packet of a stream and measure it. Raises PacketError for a damaged stream."""
     packets: list[PacketStats] = []
     state: PlayerState | None = None
@@ -219,7 +225,9 @@ def _packet(entry: Entry, data: bytes, state: PlayerState, seconds: float) -> Pa
     empty = entry.kind == PacketKind.EMPTY
     tables = coded_tables(sections, entry.kind, layout)
     return PacketStats(
-        frame=entry.frame, kind=entry.kind.name.lower(), size=entry.size,
+        frame=entry.frame,
+        kind=entry.kind.name.lower(),
+        size=entry.size,
         sections={**sizes, "header": entry.size - sum(sizes.values())},
         changed_gaussians=len(rows) if delta is None and not empty else _changing(delta),
         sent_gaussians=0 if empty else len(rows),
@@ -227,8 +235,9 @@ def _packet(entry: Entry, data: bytes, state: PlayerState, seconds: float) -> Pa
         coded=sum(table.size for table in tables),
         entropy=sum(table.entropy_bits for table in tables) / 8,
         float16_zstd=0 if empty else _plain_bytes(state, rows),
-        paper=paper_estimate(state, entry.kind), decode_ms=1000 * seconds,
-    )  # fmt: skip
+        paper=paper_estimate(state, entry.kind),
+        decode_ms=1000 * seconds,
+    )
 
 
 def _mean(values: Sequence[float]) -> float | None:

@@ -43,9 +43,7 @@ def send_key(gaussians: Gaussians[FloatArray], layout: Layout, meta: StreamMeta,
     return _decoded(packet, decode_packet(None, packet.data))
 
 
-def delta_packet(
-    player: PlayerState, delta: Delta, *, frame: int, known: KnownMotions | None = None
-) -> EncodedPacket:
+def delta_packet(player: PlayerState, delta: Delta, *, frame: int, known: KnownMotions | None = None) -> EncodedPacket:
     """Return the packet of a delta, an empty one when nothing changes. Raises ShapeError as :func:`send_delta` does."""
     if delta.is_empty:
         return encode_empty(frame=frame)

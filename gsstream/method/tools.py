@@ -84,8 +84,7 @@ class FrameBudget(Protocol):
 
 
 class Tools(Protocol):
-    """What a method may use, the method made of parts included. Only ``log`` is written to, and it ends with the frame.
-    """
+    """What a method may use, the one made of parts included. Only ``log`` is written to, and it ends with the frame."""
 
     @property
     def rng(self) -> Rng:
@@ -134,8 +133,7 @@ class Tools(Protocol):
         """Return the training images of an earlier frame while a stream is resumed. Raises InputError otherwise."""
 
     def since_key(self) -> Iterator[PlayerState]:
-        """Yield, while a stream is resumed, what players have after every packet from the last key packet on, in order.
-        """
+        """Yield, while a stream is resumed, what players have after each packet since the last key packet, in order."""
 
     def open(self, player: PlayerState, previous: Frame, frame: Frame) -> FrameTools:
         """Begin work on a frame.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsstream.core.errors import PluginUnavailable
-from gsstream.core.needs import install_extra
+from gsstream.core.install_hints import install_extra
 from gsstream.core.shapes import FloatArray
 from gsstream.metrics.psnr import check_pair
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsstream.core.errors import InputError, ShapeError
-from gsstream.core.needs import install_extra, page
+from gsstream.core.install_hints import install_extra, page
 from gsstream.core.shapes import FloatArray
 from gsstream.metrics.psnr import check_pair
 

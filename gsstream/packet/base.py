@@ -32,8 +32,13 @@ MAX_META = 16 << 20
 MAX_UNITS = 64
 MAX_CHANNELS = 64
 WIDTHS: Mapping[str, tuple[int, ...]] = {
-    "means": (3,), "quats": (4,), "scales": (3,), "opacities": (1,), "sh0": (3,), "shN": (0, 9, 24, 45)
-}  # fmt: skip
+    "means": (3,),
+    "quats": (4,),
+    "scales": (3,),
+    "opacities": (1,),
+    "sh0": (3,),
+    "shN": (0, 9, 24, 45),
+}
 
 
 def most_gaussians(size: int) -> int:
@@ -130,8 +135,9 @@ def check_file_header(data: bytes) -> str:
     if major != FORMAT_MAJOR:
         raise PacketError(
             f"packet format {major}.{minor} cannot be read: this gsstream reads {FORMAT_MAJOR}.x; "
-            "play it with the gsstream that wrote it", 8,
-        )  # fmt: skip
+            "play it with the gsstream that wrote it",
+            8,
+        )
     if minor > FORMAT_MINOR:
         raise PacketError(f"packet format {major}.{minor} is newer than {FORMAT_VERSION}: upgrade gsstream", 8)
     return f"{major}.{minor}"

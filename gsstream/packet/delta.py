@@ -34,9 +34,13 @@ KnownMotions = tuple[tuple[Motion, ...], list[tuple[str, bytes]]]
 
 
 def encode_delta(
-    delta: Delta, layout: Layout, previous_decoders: Mapping[str, FloatArray], *, frame: int,
+    delta: Delta,
+    layout: Layout,
+    previous_decoders: Mapping[str, FloatArray],
+    *,
+    frame: int,
     known: KnownMotions | None = None,
-) -> EncodedPacket:  # fmt: skip
+) -> EncodedPacket:
     """Encode one frame's changes.
 
     Raises ShapeError when a change does not fit the layout, or when there is none: that is an empty packet.
@@ -59,9 +63,7 @@ def _motion_sections(motions: tuple[Motion, ...], known: KnownMotions | None) ->
     return encode_motions(motions)
 
 
-def decode_delta(
-    data: bytes, scene: Scene, previous_decoders: Mapping[str, FloatArray], *, offset: int = 0
-) -> Delta:
+def decode_delta(data: bytes, scene: Scene, previous_decoders: Mapping[str, FloatArray], *, offset: int = 0) -> Delta:
     """Decode a complete delta packet. Raises PacketError with the byte offset."""
     _, sections = expect(data, offset, PacketKind.DELTA)
     _check_sections(sections, offset)

@@ -21,7 +21,7 @@ from gsstream.packet.base import (
     build_packet,
     expect,
     most_gaussians,
-)  # fmt: skip
+)
 from gsstream.packet.bits import compress, decompress, pack_blobs, unpack_blobs
 from gsstream.packet.layers import ORDER, decode_layers, in_layers
 from gsstream.packet.meta import StreamMeta, meta_from_json, meta_to_json
@@ -76,8 +76,9 @@ def decode_key(data: bytes, *, offset: int = 0) -> KeyState:
     if tuple(sections) != ORDER and set(sections) != wanted:
         raise PacketError(
             f"key packet: expected sections {sorted(wanted)} in any order, or {list(ORDER)} in this one, got "
-            f"{list(sections)}", offset,
-        )  # fmt: skip
+            f"{list(sections)}",
+            offset,
+        )
     with add_offset(sections["meta"].offset):
         meta = meta_from_json(decompress(sections["meta"].data, MAX_META))
     with add_offset(sections["layout"].offset):

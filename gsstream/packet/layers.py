@@ -28,7 +28,7 @@ from gsstream.packet.base import (
     most_gaussians,
     parse_header,
     split_sections,
-)  # fmt: skip
+)
 from gsstream.packet.bits import decompress, pack_blobs, unpack_blobs
 from gsstream.packet.grids import KEY_BITS
 from gsstream.packet.meta import StreamMeta, meta_from_json
@@ -91,8 +91,9 @@ def decode_layers(data: bytes, sections: Mapping[str, Section], number: int, off
     with add_offset(rest.offset):
         mask, *parts = unpack_blobs(rest.data, 1 + len(ATTRIBUTES))
         first = _mask(decode_symbols(mask, number, 1)[:, 0], in_first)
-        later = decode_rows({name: Section(part, rest.offset) for name, part in zip(ATTRIBUTES, parts, strict=True)},
-                            number - in_first)
+        later = decode_rows(
+            {name: Section(part, rest.offset) for name, part in zip(ATTRIBUTES, parts, strict=True)}, number - in_first
+        )
         if now.shN.shape[1] != later.shN.shape[1]:
             raise PacketError(f"rest: shN of {later.shN.shape[1]} coefficients, the first layer has {now.shN.shape[1]}")
     return Gaussians(**{name: _merged(first, getattr(now, name), getattr(later, name)) for name in ATTRIBUTES})

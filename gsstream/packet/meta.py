@@ -101,12 +101,19 @@ def meta_from_json(data: bytes) -> StreamMeta:
     try:
         value = json.loads(data, parse_constant=_refuse, parse_float=_finite)
         meta = StreamMeta(
-            method=_text(value["method"]), source=_text(value["source"]), recipe=_object(value["recipe"]),
-            train=_cameras(value["train"]), test=_cameras(value["test"]), fps=_number(value["fps"]),
-            background=_color(value["background"]), plugins=_object(value["plugins"]),
-            conventions=_object(value["conventions"]), version=_text(value["version"]), extra=_object(value["extra"]),
+            method=_text(value["method"]),
+            source=_text(value["source"]),
+            recipe=_object(value["recipe"]),
+            train=_cameras(value["train"]),
+            test=_cameras(value["test"]),
+            fps=_number(value["fps"]),
+            background=_color(value["background"]),
+            plugins=_object(value["plugins"]),
+            conventions=_object(value["conventions"]),
+            version=_text(value["version"]),
+            extra=_object(value["extra"]),
             world=_world(value["world"]) if "world" in value else IDENTITY,
-        )  # fmt: skip
+        )
         _check(meta)
         recorded, computed = value["recipe_hash"], meta.recipe_hash
     except KeyError as error:
@@ -167,10 +174,13 @@ def _array(name: str, value: Any, shape: tuple[int, ...]) -> None:
 
 def _rig(cameras: Cameras) -> dict[str, Any]:
     return {
-        "ids": list(cameras.ids), "width": cameras.width, "height": cameras.height, "near": cameras.near_plane,
+        "ids": list(cameras.ids),
+        "width": cameras.width,
+        "height": cameras.height,
+        "near": cameras.near_plane,
         "viewmats": np.asarray(cameras.viewmats, np.float64).reshape(-1, 16).tolist(),
         "Ks": np.asarray(cameras.Ks, np.float64).reshape(-1, 9).tolist(),
-    }  # fmt: skip
+    }
 
 
 def _cameras(value: Any) -> Cameras:

@@ -34,9 +34,7 @@ def encode_rows(gaussians: Gaussians[FloatArray]) -> dict[str, bytes]:
     return encode_codes(decoded_rows(gaussians, codes).means, codes)
 
 
-def encode_codes(
-    means: FloatArray, codes: Mapping[str, IntArray], floor: int | None = None
-) -> dict[str, bytes]:
+def encode_codes(means: FloatArray, codes: Mapping[str, IntArray], floor: int | None = None) -> dict[str, bytes]:
     """Return attribute -> payload of rows that are quantised already, positions first."""
     out = {"means": encode_positions(means, codes["scales"], KEY_BITS["scales"], floor)}
     for name, table in codes.items():

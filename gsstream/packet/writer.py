@@ -19,9 +19,7 @@ class StreamWriter:
         self._file, self.entries, self._offset = file, entries, offset
 
     @classmethod
-    def open(
-        cls, path: str | os.PathLike[str], *, resume: bool = False, last_frame: int | None = None
-    ) -> StreamWriter:
+    def open(cls, path: str | os.PathLike[str], *, resume: bool = False, last_frame: int | None = None) -> StreamWriter:
         """Begin a stream, or with ``resume`` go on with an existing one.
 
         Resuming verifies every packet, cuts an unfinished or torn last packet and the index off, and with

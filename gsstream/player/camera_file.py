@@ -38,10 +38,12 @@ def read_path(path: Path, rig: Cameras, number: int, world: World = IDENTITY) ->
     poses = np.stack([_matrix(path, f"camera {i}: w2c", entry.get("w2c"), 4) for i, entry in enumerate(entries)])
     default = data.get("K")
     scaled = rig.select([0]).scaled(*size)
-    Ks = np.stack([
-        scaled.Ks[0] if (K := entry.get("K", default)) is None else _matrix(path, f"camera {i}: K", K, 3)
-        for i, entry in enumerate(entries)
-    ])  # fmt: skip
+    Ks = np.stack(
+        [
+            scaled.Ks[0] if (K := entry.get("K", default)) is None else _matrix(path, f"camera {i}: K", K, 3)
+            for i, entry in enumerate(entries)
+        ]
+    )
     named = replace(scaled, ids=tuple(f"file-{i:04d}" for i in range(len(entries))), viewmats=poses, Ks=Ks)
     try:
         named.validate()
@@ -99,9 +101,7 @@ def _between(rig: Cameras, number: int) -> Cameras:
 def _turned(rotation: FloatArray, share: float) -> FloatArray:
     """[3, 3] a share of a rotation about its own axis."""
     angle = float(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
-    axis = np.array([
-        rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]
-    ])  # fmt: skip
+    axis = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
     if angle > np.pi - 1e-4:
         # Half a turn: the antisymmetric part vanishes, and the axis stands in the symmetric one, up to its sign.
         outer = (rotation + np.eye(3)) / 2

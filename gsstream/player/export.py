@@ -21,10 +21,15 @@ FORMATS = ("ply", "spz", "sequence")
 
 
 def export(
-    stream: str | os.PathLike[str], out: str | os.PathLike[str], kind: str, *, frames: Sequence[int] | None = None,
-    progress: Callable[[int, int], None] | None = None, max_memory: int | None = None,
+    stream: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    kind: str,
+    *,
+    frames: Sequence[int] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    max_memory: int | None = None,
     origin: Literal["recording", "local"] = "recording",
-) -> list[Path]:  # fmt: skip
+) -> list[Path]:
     """Write one file per frame into the folder ``out``; returns the files.
 
     Arguments:
@@ -100,16 +105,24 @@ def _description(playback: Playback, frames: Sequence[int], world: World) -> str
     meta = playback.meta
     cameras = [
         {
-            "id": name, "split": split, "width": rig.width, "height": rig.height, "viewmat": view.tolist(),
+            "id": name,
+            "split": split,
+            "width": rig.width,
+            "height": rig.height,
+            "viewmat": view.tolist(),
             "K": K.tolist(),
         }
         for split, rig in (("train", world.cameras(meta.train)), ("test", world.cameras(meta.test)))
         for name, view, K in zip(rig.ids, rig.viewmats, rig.Ks, strict=True)
-    ]  # fmt: skip
+    ]
     files = [{"frame": frame, "seconds": frame / meta.fps, "file": f"{frame:06d}.ply"} for frame in frames]
     data = {
-        "format": "3DGS PLY, one file per frame", "fps": meta.fps, "background": list(meta.background),
-        "viewmat": "world to camera, OpenCV axes", "frames": files, "cameras": cameras,
+        "format": "3DGS PLY, one file per frame",
+        "fps": meta.fps,
+        "background": list(meta.background),
+        "viewmat": "world to camera, OpenCV axes",
+        "frames": files,
+        "cameras": cameras,
         "offset": (np.array(meta.world.offset) - np.array(world.offset)).tolist(),
-    }  # fmt: skip
+    }
     return json.dumps(data, indent=1) + "\n"

@@ -89,7 +89,13 @@ def _rotated(quats: FloatArray, rotation: FloatArray, share: float) -> FloatArra
     x, y, z = (rotation * np.divide(part, tangent, out=np.zeros_like(part), where=tangent > 0)[:, None]).T
     w1, x1, y1, z1 = quats.astype(np.float64).T
     product = np.stack(
-        [w1 - x * x1 - y * y1 - z * z1, x1 + x * w1 + y * z1 - z * y1,
-         y1 - x * z1 + y * w1 + z * x1, z1 + x * y1 - y * x1 + z * w1], 1)  # fmt: skip
+        [
+            w1 - x * x1 - y * y1 - z * z1,
+            x1 + x * w1 + y * z1 - z * y1,
+            y1 - x * z1 + y * w1 + z * x1,
+            z1 + x * y1 - y * x1 + z * w1,
+        ],
+        1,
+    )
     turned: FloatArray = (product / np.sqrt(1 + part * part)[:, None]).astype(np.float32)
     return turned

@@ -31,14 +31,19 @@ def manifest(stream: str | os.PathLike[str]) -> dict[str, Any]:
     ends = [key.offset for key in keys[1:]] + [end]
     last = [key.frame - 1 for key in keys[1:]] + [frames[-1]]
     return {
-        "format": f"gsstream {FORMAT_VERSION}", "file": Path(stream).name, "fps": fps, "frames": len(packets),
-        "first_frame": frames[0], "header": [0, FILE_HEADER.size - 1], "packet_header_bytes": PACKET_HEADER.size,
+        "format": f"gsstream {FORMAT_VERSION}",
+        "file": Path(stream).name,
+        "fps": fps,
+        "frames": len(packets),
+        "first_frame": frames[0],
+        "header": [0, FILE_HEADER.size - 1],
+        "packet_header_bytes": PACKET_HEADER.size,
         "segments": [
             {"frames": [key.frame, final], "range": [key.offset, stop - 1]}
             for key, final, stop in zip(keys, last, ends, strict=True)
         ],
         "packets": packets,
-    }  # fmt: skip
+    }
 
 
 def manifest_json(stream: str | os.PathLike[str]) -> str:

@@ -54,9 +54,11 @@ def joined(rigs: Sequence[Cameras]) -> Cameras:
     first = rigs[0]
     scaled = [rig.scaled(first.width, first.height) for rig in rigs]
     return replace(
-        first, ids=tuple(name for rig in rigs for name in rig.ids),
-        viewmats=np.concatenate([rig.viewmats for rig in scaled]), Ks=np.concatenate([rig.Ks for rig in scaled]),
-    )  # fmt: skip
+        first,
+        ids=tuple(name for rig in rigs for name in rig.ids),
+        viewmats=np.concatenate([rig.viewmats for rig in scaled]),
+        Ks=np.concatenate([rig.Ks for rig in scaled]),
+    )
 
 
 def resized(rig: Cameras, width: int, height: int) -> Cameras:

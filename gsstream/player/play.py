@@ -15,7 +15,7 @@ from PIL import Image
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError, OutputError
-from gsstream.core.needs import install_extra
+from gsstream.core.install_hints import install_extra
 from gsstream.core.shapes import FloatArray
 from gsstream.player.camera_file import read_path
 from gsstream.player.interpolation import Moments, frame_times
@@ -39,11 +39,17 @@ class Played:
 
 
 def play(
-    stream: str | os.PathLike[str], out: str | os.PathLike[str], *, camera: str | None = None,
-    frames: Sequence[int] | None = None, fps: float | None = None, renderer: PlayerRenderer | None = None,
-    progress: Callable[[int, int], None] | None = None, max_memory: int | None = None,
+    stream: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    camera: str | None = None,
+    frames: Sequence[int] | None = None,
+    fps: float | None = None,
+    renderer: PlayerRenderer | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    max_memory: int | None = None,
     size: tuple[int, int] | None = None,
-) -> Played:  # fmt: skip
+) -> Played:
     """Render a stream from one camera.
 
     Raises InputError for an unknown camera or frame and beyond ``max_memory``, PacketError for a damaged stream
@@ -107,9 +113,12 @@ def choose_cameras(playback: Playback, camera: str | None, number: int) -> Camer
 
 
 def _images(
-    playback: Playback, times: Sequence[float], cameras: Cameras, renderer: PlayerRenderer | None,
+    playback: Playback,
+    times: Sequence[float],
+    cameras: Cameras,
+    renderer: PlayerRenderer | None,
     progress: Callable[[int, int], None] | None,
-) -> Iterator[Bytes]:  # fmt: skip
+) -> Iterator[Bytes]:
     background, scenes = playback.meta.background, Moments(playback)
     last: tuple[object, int, FloatArray] | None = None
     for i, time in enumerate(times):

@@ -111,8 +111,9 @@ class Playback:
             warnings.warn(
                 f"{self.reader.path} ends in an unfinished packet ({tail.size} bytes from byte {tail.offset}): its run "
                 f"is still writing or was killed; frames {first} to {end - 1} are complete",
-                TruncatedStreamWarning, stacklevel=2,
-            )  # fmt: skip
+                TruncatedStreamWarning,
+                stacklevel=2,
+            )
         lost = self.reader.damage if stop is None or stop > end else None
         return range(start, end if stop is None else min(stop, end)), lost
 

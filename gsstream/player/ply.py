@@ -28,11 +28,15 @@ def ply_bytes(gaussians: Gaussians[FloatArray], comments: Sequence[str] = ()) ->
     head += [f"element vertex {number}"]
     head += [*(f"property float {name}" for name in names), "end_header\n"]
     columns = [
-        gaussians.means, np.zeros((number, 3)), gaussians.sh0.reshape(number, 3),
+        gaussians.means,
+        np.zeros((number, 3)),
+        gaussians.sh0.reshape(number, 3),
         # [N, K - 1, 3] -> channel by channel: all of red, then green, then blue.
         gaussians.shN.transpose(0, 2, 1).reshape(number, 3 * rest),
-        gaussians.opacities[:, None], gaussians.scales, gaussians.quats,
-    ]  # fmt: skip
+        gaussians.opacities[:, None],
+        gaussians.scales,
+        gaussians.quats,
+    ]
     return "\n".join(head).encode("ascii") + np.concatenate(columns, 1).astype("<f4").tobytes()
 
 
@@ -73,11 +77,13 @@ def read_ply(path: str | os.PathLike[str]) -> tuple[Gaussians[FloatArray], tuple
         return np.ascontiguousarray(values, np.float32)
 
     gaussians = Gaussians(
-        means=columns("x", "y", "z"), quats=columns(*(f"rot_{i}" for i in range(4))),
-        scales=columns(*(f"scale_{i}" for i in range(3))), opacities=columns("opacity")[:, 0],
+        means=columns("x", "y", "z"),
+        quats=columns(*(f"rot_{i}" for i in range(4))),
+        scales=columns(*(f"scale_{i}" for i in range(3))),
+        opacities=columns("opacity")[:, 0],
         sh0=columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None],
         shN=columns(*(f"f_rest_{i}" for i in range(rest))).reshape(number, 3, rest // 3).transpose(0, 2, 1).copy(),
-    )  # fmt: skip
+    )
     return gaussians, offset
 
 

@@ -84,10 +84,13 @@ def recorded_region(rig: Cameras) -> Region:
     distance = np.linalg.norm(rig.centers - focus, axis=1)
     middle, half = (elevation.max() + elevation.min()) / 2, max((elevation.max() - elevation.min()) / 2, MIN_SWING)
     return Region(
-        focus, up, outward, _arc(azimuth[level]) if level.any() else None,
+        focus,
+        up,
+        outward,
+        _arc(azimuth[level]) if level.any() else None,
         (float(middle - half), float(middle + half)),
         (float(NEAREST * distance.min()), float(FARTHEST * distance.max())),
-    )  # fmt: skip
+    )
 
 
 def focus_point(rig: Cameras) -> FloatArray:

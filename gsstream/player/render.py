@@ -23,7 +23,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import PluginUnavailable, UnknownName
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.needs import install_renderer
+from gsstream.core.install_hints import install_renderer
 from gsstream.core.shapes import FloatArray, check_finite, check_shape
 from gsstream.player.software import render_numpy
 
@@ -89,9 +89,12 @@ def _load(point: importlib.metadata.EntryPoint) -> PlayerRenderer:
 
 
 def render(
-    gaussians: Gaussians[FloatArray], cameras: Cameras, view: int = 0,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0), renderer: PlayerRenderer | None = None,
-) -> FloatArray:  # fmt: skip
+    gaussians: Gaussians[FloatArray],
+    cameras: Cameras,
+    view: int = 0,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    renderer: PlayerRenderer | None = None,
+) -> FloatArray:
     """Render one camera of a rig: [H, W, 3] float32, not clamped above 1.
 
     Arguments:

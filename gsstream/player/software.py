@@ -20,9 +20,14 @@ TILE = 16
 
 
 def render_numpy(
-    arrays: Sequence[FloatArray], viewmat: FloatArray, K: FloatArray, width: int, height: int,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0), near: float = 0.01,
-) -> FloatArray:  # fmt: skip
+    arrays: Sequence[FloatArray],
+    viewmat: FloatArray,
+    K: FloatArray,
+    width: int,
+    height: int,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    near: float = 0.01,
+) -> FloatArray:
     """Render raw Gaussians (means, quats, scales, opacities, sh0, shN) for one camera: [height, width, 3] float32."""
     means, quats, scales, opacities, sh0, shN = arrays
     viewmat, K = np.asarray(viewmat, np.float64), np.asarray(K, np.float64)
@@ -49,9 +54,14 @@ def render_numpy(
 
 
 def _project(
-    points: FloatArray, quats: FloatArray, scales: FloatArray, viewmat: FloatArray, K: FloatArray, width: int,
+    points: FloatArray,
+    quats: FloatArray,
+    scales: FloatArray,
+    viewmat: FloatArray,
+    K: FloatArray,
+    width: int,
     height: int,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+) -> tuple[FloatArray, FloatArray]:
     """Means2d [N, 2] px and blurred covariances [N, 3] (xx, xy, yy) px^2 (EWA splatting, Zwicker et al. 2001)."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     x, y, depth = points.T

@@ -81,18 +81,20 @@ class Budget(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
     time: Seconds | None = Field(
-        default=None, gt=0,
+        default=None,
+        gt=0,
         description="seconds from a frame's images in memory to its packet on disk, e.g. 1.0s, 800ms; the bytes then "
         "depend on the clock",
-    )  # fmt: skip
+    )
     size: Packet | None = Field(
         default=None, ge=MIN_SIZE, description="bytes of a frame's packet, e.g. 20KB; an empty packet has 16"
     )
     rate: Rate | None = Field(
-        default=None, gt=0,
+        default=None,
+        gt=0,
         description="bits per second of playback, e.g. 2Mbit/s: no packet after the first is larger than its share, "
         "rate / 8 / frames per second; a run turns it into that size",
-    )  # fmt: skip
+    )
     memory: Memory | None = Field(
         default=None, ge=1, description="peak resident memory of the process, e.g. 2GB; limits Gaussians and caches"
     )

@@ -56,9 +56,12 @@ class ResolvedRecipe:
 
 
 def resolve_recipe(
-    method: str | None, find_method: FindMethod, files: Sequence[Path] = (), overrides: Sequence[tuple[str, str]] = (),
+    method: str | None,
+    find_method: FindMethod,
+    files: Sequence[Path] = (),
+    overrides: Sequence[tuple[str, str]] = (),
     layers: Sequence[Layer] = (),
-) -> ResolvedRecipe:  # fmt: skip
+) -> ResolvedRecipe:
     """Stack the layers and validate the result; every problem found is reported in one error.
 
     Raises:

@@ -50,19 +50,22 @@ class FirstFrame(Section):
     )
     max_points: int = Field(default=12_000, ge=1, description="points kept before the structure seeds anchors")
     lr_means: float = Field(
-        default=1.6e-4, ge=0,
+        default=1.6e-4,
+        ge=0,
         description="learning rate of centres, fraction of the rig's extent; a hundredth of it at the last iteration",
-    )  # fmt: skip
+    )
     coarse_to_fine: bool = Field(
         default=True,
         description="fit pictures of a quarter and a half of the size first, where those are at least 320 pixels wide; "
         "it takes six to seven tenths of the iterations",
     )
     noise: float = Field(
-        default=0.0, ge=0, le=0.1,
+        default=0.0,
+        ge=0,
+        le=0.1,
         description="standard deviation of noise on every centre, drawn anew in every iteration, fraction of the rig's "
         "extent (HiCoM): Gaussians that few cameras see fit them less closely",
-    )  # fmt: skip
+    )
     few_cameras: bool = Field(
         default=True,
         description="help few cameras, which cannot tell a surface from a cloud that is right from one of them: with "
@@ -70,16 +73,19 @@ class FirstFrame(Section):
         "elsewhere, keep inverse depth smooth where the training image has no edge",
     )
     lr_factor: float = Field(
-        default=2.0, gt=0, le=100,
+        default=2.0,
+        gt=0,
+        le=100,
         description="factor on 3DGS's learning rates of everything but the centres, which are meant for 30,000 "
         "iterations: in fewer, Gaussians that grow into place faster leave less for added ones to fill; 1: as there",
-    )  # fmt: skip
+    )
     max_gaussians: int = Field(default=200_000, ge=1, description="upper bound on the number of Gaussians")
     prune_error: float = Field(
-        default=10.0, ge=0,
+        default=10.0,
+        ge=0,
         description="a Gaussian goes, when growth has ended, whose absence changes all training images by less than "
         "this many mean squared errors of one channel of a pixel; 0: none goes",
-    )  # fmt: skip
+    )
     shell: bool = Field(
         default=True,
         description="large seeds on a sphere around what the cameras look at, so that walls, floor and sky have a "
@@ -89,33 +95,41 @@ class FirstFrame(Section):
         default=False, description="fit an affine colour map per training camera while optimising frame 0"
     )
 
+
 class Stream(Section):
     """Every later frame."""
 
     epochs: int = Field(default=20, ge=1, description="passes over the training cameras per frame (fast: 10, edge: 6)")
     lr_final_factor: float = Field(
-        default=1.0, gt=0, le=1,
+        default=1.0,
+        gt=0,
+        le=1,
         description="factor on the learning rates of residuals at the last iteration of a frame, log-linear from 1 at "
         "the first; the rate of gates stays",
-    )  # fmt: skip
+    )
     active_threshold: float = Field(
         default=0.0, ge=0, le=1, description="rows whose gate opens with at most this probability are left out"
     )
     change_threshold: float = Field(
-        default=0.0, ge=0, le=100,
+        default=0.0,
+        ge=0,
+        le=100,
         description="tiles whose pixels differ from the last frame by more than this many sigmas of their own spread "
         "count as changed; only Gaussians visible in them take part, and only until their gate has closed. 0: "
         "everything takes part to the end",
-    )  # fmt: skip
+    )
     rd_lambda: float = Field(
-        default=0.0, ge=0, le=1,
+        default=0.0,
+        ge=0,
+        le=1,
         description="weight in the loss of the residual's estimated bits per pixel of one view; 0: none",
-    )  # fmt: skip
+    )
     refine_frames: int = Field(
-        default=0, ge=0,
+        default=0,
+        ge=0,
         description="later frames in each of which a first frame that was made in few iterations goes on being "
         "optimised, beside the stream; then a key packet brings the result. 0: none. For live recordings",
-    )  # fmt: skip
+    )
     refine_iterations: int = Field(
         default=0, ge=0, description="iterations that each of these frames gives to it; 0 where refine_frames is 0"
     )
@@ -151,20 +165,25 @@ class Codec(Section):
         default=0, ge=0, description="most frames from one key packet to the next, which replaces a delta; 0: no period"
     )
     trim: float = Field(
-        default=0.0, ge=0, lt=1,
+        default=0.0,
+        ge=0,
+        lt=1,
         description="share of each delta packet's bytes given up, the symbols and gates that explain least per bit; "
         "not read under a budget of size, which trims as far as it must",
-    )  # fmt: skip
+    )
     key_rd_lambda: float = Field(
-        default=0.1, ge=0,
+        default=0.1,
+        ge=0,
         description="squared error that a bit of frame 0 must save, in mean squared errors of one channel of a "
         "training image's pixel; 0: every value is rounded to the nearest",
-    )  # fmt: skip
+    )
     first_layer: float = Field(
-        default=0.5, gt=0, le=1,
+        default=0.5,
+        gt=0,
+        le=1,
         description="share of frame 0's Gaussians that stand first in its packet, those that the training images would "
         "miss most: players draw them while the rest is on its way; 1: all stand together",
-    )  # fmt: skip
+    )
 
 
 class Recipe(Section):

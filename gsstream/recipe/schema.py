@@ -80,9 +80,11 @@ def _slot(
     if not unread:
         any_part["propertyNames"] = {"enum": sorted(keys)}
     section = {
-        "type": "object", "properties": {"name": choice, "params": any_part}, "additionalProperties": False,
+        "type": "object",
+        "properties": {"name": choice, "params": any_part},
+        "additionalProperties": False,
         "allOf": cases,
-    }  # fmt: skip
+    }
     return {"description": choice["description"], "anyOf": [choice, section]}
 
 

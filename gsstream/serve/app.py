@@ -100,13 +100,15 @@ def make_app(stream: Path, *, live: bool, rules: Rules, max_viewers: int, hub_of
         ],
         middleware=[
             Middleware(
-                CORSMiddleware, allow_origins=list(rules.origins), allow_headers=["Range"],
+                CORSMiddleware,
+                allow_origins=list(rules.origins),
+                allow_headers=["Range"],
                 expose_headers=["Content-Range", "ETag"],
             ),
             Middleware(_Guard, rules=rules),
         ],
         lifespan=lifespan,
-    )  # fmt: skip
+    )
 
 
 class _Guard:
@@ -178,10 +180,15 @@ def _manifest(follower: Follower, *, live: bool) -> Response:
         }
         for start, stop in zip(follower.keys, ends, strict=True)
     ]
-    return JSONResponse({
-        "format": f"gsstream {FORMAT_VERSION}", "file": STREAM.removeprefix("/"), "frames": len(frames),
-        "first_frame": frames[0].frame, "segments": segments,
-    })  # fmt: skip
+    return JSONResponse(
+        {
+            "format": f"gsstream {FORMAT_VERSION}",
+            "file": STREAM.removeprefix("/"),
+            "frames": len(frames),
+            "first_frame": frames[0].frame,
+            "segments": segments,
+        }
+    )
 
 
 def _file(stream: Path) -> Response:

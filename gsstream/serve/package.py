@@ -44,9 +44,12 @@ class Package(NamedTuple):
 
 
 def package(
-    stream: str | os.PathLike[str], out: str | os.PathLike[str], *,
-    renditions: Sequence[str | os.PathLike[str]] = (), join_every: float = 10.0,
-) -> Package:  # fmt: skip
+    stream: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    renditions: Sequence[str | os.PathLike[str]] = (),
+    join_every: float = 10.0,
+) -> Package:
     """Write page, manifest and one file for each key segment.
 
     A segment is a key packet with all that follows up to the next one, behind a file header: a valid stream. Its name
@@ -130,9 +133,13 @@ def _write_stream(path: Path, folder: Path, join_every: float) -> dict[str, Any]
         ]
         frames = reader.frames
     return {
-        "name": path.parent.name if path.name == "stream.gss" else path.stem, "fps": first.meta.fps,
-        "frames": len(frames), "first_frame": frames[0].frame, "gaussians": len(first.gaussians), "segments": segments,
-    }  # fmt: skip
+        "name": path.parent.name if path.name == "stream.gss" else path.stem,
+        "fps": first.meta.fps,
+        "frames": len(frames),
+        "first_frame": frames[0].frame,
+        "gaussians": len(first.gaussians),
+        "segments": segments,
+    }
 
 
 def _write_segment(reader: StreamReader, entries: Sequence[Entry], folder: Path, every: int) -> dict[str, Any]:
@@ -142,9 +149,12 @@ def _write_segment(reader: StreamReader, entries: Sequence[Entry], folder: Path,
     data = header + b"".join(reader.read(entry) for entry in entries)
     shift = len(header) - entries[0].offset
     segment: dict[str, Any] = {
-        "frames": [entries[0].frame, entries[-1].frame], "file": _write(folder, entries[0].frame, ".gss", data),
-        "bytes": len(data), "key_bytes": shift + entries[0].offset + entries[0].size, "joins": [],
-    }  # fmt: skip
+        "frames": [entries[0].frame, entries[-1].frame],
+        "file": _write(folder, entries[0].frame, ".gss", data),
+        "bytes": len(data),
+        "key_bytes": shift + entries[0].offset + entries[0].size,
+        "joins": [],
+    }
     if len(entries) <= every:
         return segment
     state = key = decode_packet(None, reader.read(entries[0]), offset=entries[0].offset)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import quote, urlsplit
 
 from gsstream.core.errors import InputError, OutputError
-from gsstream.core.needs import install_extra
+from gsstream.core.install_hints import install_extra
 from gsstream.serve.app import Rules, make_app
 from gsstream.serve.local import HOST as LOOPBACK
 
@@ -37,9 +37,16 @@ class Server:
     """
 
     def __init__(
-        self, stream: str | os.PathLike[str], *, live: bool = False, host: str = LOOPBACK, port: int = 8000,
-        token: str | None = None, origins: Sequence[str] = (), max_viewers: int = 16,
-    ) -> None:  # fmt: skip
+        self,
+        stream: str | os.PathLike[str],
+        *,
+        live: bool = False,
+        host: str = LOOPBACK,
+        port: int = 8000,
+        token: str | None = None,
+        origins: Sequence[str] = (),
+        max_viewers: int = 16,
+    ) -> None:
         """Take the address.
 
         Raises InputError without starlette and uvicorn or for an impossible origin, OutputError when nothing can be
@@ -57,9 +64,12 @@ class Server:
         self.token, self.max_viewers = token, max_viewers
         self._hubs: list[Hub] = []
         self.app = make_app(
-            Path(stream), live=live, rules=Rules(token, tuple(origins), hosts), max_viewers=max_viewers,
+            Path(stream),
+            live=live,
+            rules=Rules(token, tuple(origins), hosts),
+            max_viewers=max_viewers,
             hub_of=self._hubs,
-        )  # fmt: skip
+        )
         self._socket = _listen(host, port)
         self.host, self.port = host, self._socket.getsockname()[1]
         self._thread: threading.Thread | None = None
@@ -103,10 +113,20 @@ class Server:
         import uvicorn
 
         config = uvicorn.Config(
-            self.app, log_config=None, access_log=False, log_level="warning", lifespan="on", server_header=False,
-            ws="websockets-sansio", ws_max_size=_MAX_MESSAGE_BYTES, ws_per_message_deflate=False, ws_ping_interval=20,
-            ws_ping_timeout=60, limit_concurrency=4 * self.max_viewers + 64, timeout_graceful_shutdown=1,
-        )  # fmt: skip
+            self.app,
+            log_config=None,
+            access_log=False,
+            log_level="warning",
+            lifespan="on",
+            server_header=False,
+            ws="websockets-sansio",
+            ws_max_size=_MAX_MESSAGE_BYTES,
+            ws_per_message_deflate=False,
+            ws_ping_interval=20,
+            ws_ping_timeout=60,
+            limit_concurrency=4 * self.max_viewers + 64,
+            timeout_graceful_shutdown=1,
+        )
         server = uvicorn.Server(config)
         self._loop = asyncio.get_running_loop()
         task = asyncio.create_task(server.serve(sockets=[self._socket]))

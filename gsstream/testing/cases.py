@@ -99,13 +99,19 @@ class World:
     def permuted(self, order: torch.Tensor) -> World:
         """Return the same world with the Gaussians in another order."""
         return replace(
-            self, gaussians=self.gaussians.rows(order), moving_mask=self.moving_mask[order], logits=self.logits[order],
-            residual=self.residual[order], hierarchy=self.hierarchy.rows(order),
+            self,
+            gaussians=self.gaussians.rows(order),
+            moving_mask=self.moving_mask[order],
+            logits=self.logits[order],
+            residual=self.residual[order],
+            hierarchy=self.hierarchy.rows(order),
             anchors=replace(
-                self.anchors, positions=self.anchors.positions[order], colors=self.anchors.colors[order],
+                self.anchors,
+                positions=self.anchors.positions[order],
+                colors=self.anchors.colors[order],
                 levels=self.anchors.levels[order],
             ),
-        )  # fmt: skip
+        )
 
     def double(self) -> World:
         """Return the same world with logits and residuals in double precision."""
@@ -178,10 +184,18 @@ def make_case(name: str, before: Scene, cameras: Cameras, *, shift: float = 0.0)
     sizes = torch.tensor([0.5, 0.25]) * max(1.0, float(before.means.abs().max()) if n else 1.0)
     origin = before.means.amin(0) - 0.1 if n else torch.zeros(3)
     return World(
-        name, before, cameras, images(before, cameras), images(replace(before, means=means), cameras), moving_mask,
-        3 * torch.randn(n, generator=g), torch.randn(n, 3, generator=g), forest(n),
-        PointCloud(xyz, rgb.numpy(), name), Anchors(before.means.clone(), rgb, levels, sizes, origin),
-    )  # fmt: skip
+        name,
+        before,
+        cameras,
+        images(before, cameras),
+        images(replace(before, means=means), cameras),
+        moving_mask,
+        3 * torch.randn(n, generator=g),
+        torch.randn(n, 3, generator=g),
+        forest(n),
+        PointCloud(xyz, rgb.numpy(), name),
+        Anchors(before.means.clone(), rgb, levels, sizes, origin),
+    )
 
 
 def images(gaussians: Scene, cameras: Cameras) -> tuple[torch.Tensor, ...]:
@@ -228,10 +242,12 @@ def _sized(name: str, factor: float) -> World:
     viewmats[:, :3, 3] *= factor
     lengths = {key: factor * getattr(anchors, key) for key in ("positions", "cell_sizes", "origin")}
     return replace(
-        base, gaussians=replace(blobs, means=factor * blobs.means, scales=blobs.scales + math.log(factor)),
+        base,
+        gaussians=replace(blobs, means=factor * blobs.means, scales=blobs.scales + math.log(factor)),
         cameras=replace(cameras, viewmats=viewmats, near_plane=factor * cameras.near_plane),
-        points=replace(base.points, xyz=np.float32(factor) * base.points.xyz), anchors=replace(anchors, **lengths),
-    )  # fmt: skip
+        points=replace(base.points, xyz=np.float32(factor) * base.points.xyz),
+        anchors=replace(anchors, **lengths),
+    )
 
 
 def _sure(name: str, size: float) -> World:

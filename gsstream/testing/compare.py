@@ -34,18 +34,19 @@ def equal(what: str, got: torch.Tensor, expected: torch.Tensor, tolerance: float
 
 
 def all_equal(
-    what: str, got: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor], tolerance: float = 0.0,
+    what: str,
+    got: Mapping[str, torch.Tensor],
+    expected: Mapping[str, torch.Tensor],
+    tolerance: float = 0.0,
     why: str = EXACT,
-) -> None:  # fmt: skip
+) -> None:
     """Apply :func:`equal` to every named tensor; the names must agree too."""
     assert set(got) == set(expected), f"{what}: expected the outputs {sorted(expected)}, got {sorted(got)}"
     for name, value in expected.items():
         equal(f"{what}: {name}", got[name], value, tolerance, why)
 
 
-def relative(
-    what: str, got: torch.Tensor, expected: torch.Tensor, tolerance: float, why: str, *, floor: float
-) -> None:
+def relative(what: str, got: torch.Tensor, expected: torch.Tensor, tolerance: float, why: str, *, floor: float) -> None:
     """Apply :func:`equal` to fractions of the largest expected value, which is taken to be at least ``floor``."""
     assert floor > 0, f"{what}: expected a floor above 0, got {floor}"
     scale = max(float(expected.abs().max()), floor) if expected.numel() else 1.0

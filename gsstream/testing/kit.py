@@ -190,4 +190,3 @@ def summary(results: Sequence[CheckResult]) -> str:
     order: tuple[Status, ...] = ("passed", "failed", "warning", "expected failure", "skipped")
     counts = {status: sum(result.status == status for result in results) for status in order}
     return ", ".join(f"{number} {status}" for status, number in counts.items() if number)
-

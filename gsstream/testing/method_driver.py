@@ -9,25 +9,28 @@ from pathlib import Path
 from typing import Any
 
 from gsstream.core.frame import Frame
+from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.encoder import Encoder
 from gsstream.input.recordings.open import open_source
 from gsstream.method.base import Step, StreamingMethod
 from gsstream.packet import PlayerState, decode_packet
-from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import ComponentRef
 
 SOURCE = "synthetic:frames=4&views=3&width=32&height=24&supersample=1"
 TINY = (
-    "first_frame.max_iterations=8", "first_frame.max_points=200", "stream.epochs=1",
+    "first_frame.max_iterations=8",
+    "first_frame.max_points=200",
+    "stream.epochs=1",
     # Pictures of so few pixels would miss so few Gaussians that a method had nothing to do.
     "first_frame.prune_error=0",
     "first_frame.points=recording",
     # The analytic scene stands before black; in eight iterations, a shell would be most of what is seen.
-    "background=[0,0,0]", "first_frame.shell=false",
-)  # fmt: skip
+    "background=[0,0,0]",
+    "first_frame.shell=false",
+)
 FRAMES = 3
 
 
@@ -44,11 +47,11 @@ class MethodUnderTest:
         learns = bool(catalog.resolve("update", recipe.update.name)().codes())
         kept = [text for text in TINY if not text.startswith("stream.") or (learns and reads(text.partition("=")[0]))]
         overrides = [("the contract kit", text) for text in kept]
-        self.parts: Assembly = assemble(resolve_recipe(name, catalog.recipe_path, (), overrides), catalog)
+        self.assembly: Assembly = assemble(resolve_recipe(name, catalog.recipe_path, (), overrides), catalog)
         if method is not None:
             ref = ComponentRef(name="under-test", params=method.config.model_dump(mode="json"))
-            recipe = self.parts.recipe.model_copy(update={"streaming_method": ref})
-            self.parts = replace(self.parts, streaming_method=method, recipe=recipe)
+            recipe = self.assembly.recipe.model_copy(update={"streaming_method": ref})
+            self.assembly = replace(self.assembly, streaming_method=method, recipe=recipe)
 
     def __repr__(self) -> str:
         return f"method {self.name}"
@@ -56,16 +59,18 @@ class MethodUnderTest:
     @property
     def min_cameras(self) -> int:
         """How many training cameras it says it needs."""
-        return self.parts.streaming_method.min_cameras
+        return self.assembly.streaming_method.min_cameras
 
     def encoder(self, uri: str = SOURCE, first: PlayerState | None = None) -> Encoder:
         """Return an encoder of this method, before frame 0."""
         source = open_source(uri)
-        settings, parts = self.parts.recipe.first_frame, self.parts
+        settings, assembly = self.assembly.recipe.first_frame, self.assembly
         encoder = Encoder(
-            parts, source.info, lambda frame: gather_points(source, frame, settings),
+            assembly,
+            source.info,
+            lambda frame: gather_points(source, frame, settings),
             first_frame=first,
-        )  # fmt: skip
+        )
         return encoder
 
     def begin(self, frame: Frame, uri: str = SOURCE) -> Step[Any]:

@@ -25,9 +25,14 @@ NAME = "pretend"
 aten = torch.ops.aten
 #: Operations whose result has a size that depends on values: a GPU has to be waited for.
 SIZED_BY_VALUES = {
-    aten.nonzero.default, aten.masked_select.default, aten._unique2.default, aten.unique_consecutive.default,
-    aten.unique_dim.default, aten.repeat_interleave.Tensor, aten.bincount.default,
-}  # fmt: skip
+    aten.nonzero.default,
+    aten.masked_select.default,
+    aten._unique2.default,
+    aten.unique_consecutive.default,
+    aten.unique_dim.default,
+    aten.repeat_interleave.Tensor,
+    aten.bincount.default,
+}
 
 ALLOCATIONS = {aten.empty.memory_format, aten.empty_like.default, aten.empty_strided.default}
 
@@ -53,9 +58,14 @@ class PretendTensor(torch.Tensor):
     @staticmethod
     def __new__(cls, memory: torch.Tensor) -> PretendTensor:
         out: PretendTensor = torch.Tensor._make_wrapper_subclass(
-            cls, memory.size(), strides=memory.stride(), storage_offset=memory.storage_offset(), dtype=memory.dtype,
-            layout=memory.layout, device=DEVICE,
-        )  # fmt: skip
+            cls,
+            memory.size(),
+            strides=memory.stride(),
+            storage_offset=memory.storage_offset(),
+            dtype=memory.dtype,
+            layout=memory.layout,
+            device=DEVICE,
+        )
         out.memory = memory
         return out
 
@@ -202,8 +212,11 @@ class _Kernel(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *upstream: Any) -> Any:
-        roots = [(x, grad.memory) for x, grad in zip(ctx.out, upstream, strict=True)
-                 if isinstance(x, torch.Tensor) and x.requires_grad and grad is not None]  # fmt: skip
+        roots = [
+            (x, grad.memory)
+            for x, grad in zip(ctx.out, upstream, strict=True)
+            if isinstance(x, torch.Tensor) and x.requires_grad and grad is not None
+        ]
         leaves = [x for x in ctx.inner if isinstance(x, torch.Tensor) and x.requires_grad]
         outputs, grads = [x for x, _ in roots], [grad for _, grad in roots]
         found = iter(torch.autograd.grad(outputs, leaves, grads, retain_graph=True, allow_unused=True))

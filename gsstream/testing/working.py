@@ -51,15 +51,15 @@ def fit_fixture(*, changed: bool = True) -> FitFixture:
     if not changed:
         change = Change(torch.zeros_like(change.tiles), change.height, change.width)
     frame = replace(frame, index=INDEX, cameras=state.previous.cameras)
-    view = EngineContext(method.parts, state, frame, FrameLog(), change)
-    return FitFixture(state.player.scene, view, Rng(method.parts.recipe.seed))
+    view = EngineContext(method.assembly, state, frame, FrameLog(), change)
+    return FitFixture(state.player.scene, view, Rng(method.assembly.recipe.seed))
 
 
 def method_with(slot: str, part: Part) -> MethodUnderTest:
     """Return a dense method that has this part in its slot; its frames are encoded when they are asked for."""
     method = MethodUnderTest("dense")
     changed: dict[str, Any] = {slot: part}
-    method.parts = replace(method.parts, **changed)
+    method.assembly = replace(method.assembly, **changed)
     return method
 
 

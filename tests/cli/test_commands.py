@@ -13,7 +13,7 @@ from typer.main import get_command
 
 from gsstream.cli.main import app, run_command
 from gsstream.cli.table import whole_table
-from gsstream.plugins.builtin import gsstream_commands
+from gsstream.discovery.builtin import gsstream_commands
 
 CHEAP = [
     ["--help"],
@@ -131,9 +131,7 @@ def test_cheap_commands_import_no_torch() -> None:
 def test_a_shell_completes_names_and_choices(words: str, offered: str) -> None:
     settings = {"_GSSTREAM_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
     command = [sys.executable, "-c", "from gsstream.cli.main import main; main()"]
-    done = subprocess.run(
-        command, capture_output=True, text=True, timeout=600, check=False, env=os.environ | settings
-    )
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False, env=os.environ | settings)
     assert (done.stdout.strip(), done.stderr) == (offered, "")
 
 
@@ -208,7 +206,7 @@ def test_interrupts_have_code_130(capsys: pytest.CaptureFixture[str], monkeypatc
     def interrupt() -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gsstream.plugins.catalog.discover", interrupt)
+    monkeypatch.setattr("gsstream.discovery.catalog.discover", interrupt)
     assert run(capsys, "methods") == (130, "", "interrupted\n")
 
 
@@ -256,7 +254,7 @@ def test_show_says_which_methods_set_what(
 ) -> None:
     recipe = tmp_path / "mine.yaml"
     recipe.write_text("base: dense\nstructure: {name: flat, params: {resolution: 77}}\n")
-    from gsstream.plugins.catalog import Catalog
+    from gsstream.discovery.catalog import Catalog
 
     found = Catalog.recipe_path
     monkeypatch.setattr(Catalog, "names", lambda _, kind: ["dense", "mine"] if kind == "method" else ["flat"])
@@ -289,8 +287,10 @@ def test_info_of_a_stream_with_terminal_escapes(tmp_path, capsys: pytest.Capture
 
     rig = Cameras(("cam",), np.eye(4)[None], np.diag([8.0, 8.0, 1.0])[None], 8, 8)
     meta = StreamMeta("x\x1b[2J\n  forged     1", "\x07", {}, rig, rig.select([]), 30.0)
-    f32 = {name: np.zeros((1, *shape), np.float32) for name, shape in
-           {"means": (3,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (0, 3)}.items()}  # fmt: skip
+    f32 = {
+        name: np.zeros((1, *shape), np.float32)
+        for name, shape in {"means": (3,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (0, 3)}.items()
+    }
     scene = Gaussians(quats=np.float32([[1, 0, 0, 0]]), **f32)
     layout = Layout(np.int32([1]), np.uint8([0]), np.float32([1]))
     with StreamWriter.open(tmp_path / "s.gss") as writer:

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from gsstream.core.kinds import PART_KINDS
+from gsstream.discovery.catalog import load_catalog
 from gsstream.input.recordings.open import open_source
 from gsstream.parts.confidence.uniform import Uniform
 from gsstream.parts.gate.always_open import AlwaysOpen
 from gsstream.parts.gate.base import GateSampler
 from gsstream.parts.structure.flat import Flat
-from gsstream.plugins.catalog import load_catalog
 from gsstream.testing import SourceUnderTest, parametrize_with_checks, run_checks
 from gsstream.testing.confidence.example import ExampleConfidence
 from gsstream.testing.gate.example import ExampleGate

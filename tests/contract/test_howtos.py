@@ -14,10 +14,10 @@ from fresh import gsstream, install, python
 
 from gsstream.core.kinds import CONTRACTS
 from gsstream.core.part import Part
+from gsstream.discovery.catalog import load_catalog
+from gsstream.discovery.discovery import Discovered
 from gsstream.engine.run.recording import open_recording
 from gsstream.input.recordings.prefetch import Prefetcher
-from gsstream.plugins.catalog import load_catalog
-from gsstream.plugins.discovery import Discovered
 from gsstream.recipe.model import Recipe
 from gsstream.spec import ComponentSpec
 from gsstream.testing import run_checks

@@ -110,14 +110,14 @@ class Half(GateSampler):
     def open_probability(self, logits): return torch.ones_like(logits)
     def bound(self, logits): return logits.clamp(-5, 5)
 '''
-PLUGIN = '''
+PLUGIN = """
 from gsstream.spec import ComponentSpec, hookimpl
 
 
 @hookimpl
 def gsstream_components():
     return [ComponentSpec(kind="gate", name="half", target="gsstream_half_gate:Half", summary="half open")]
-'''
+"""
 
 
 def test_a_sound_part(capsys: pytest.CaptureFixture[str]) -> None:

@@ -73,6 +73,7 @@ class TestFlat:
         assert torch.equal(hierarchy.parent, torch.arange(20))
         assert np.array_equal(anchors.positions.numpy(), points.xyz)
 
+
 class TestGroupMax:
     """The contract kit says the rest: at least each member, no more than the largest, no other group."""
 
@@ -161,11 +162,12 @@ def transmitted(
     units = torch.from_numpy(layout.units_of(active))
     trained = train_rows(rule, base, gate, latents, decoders, units)
     residual = Residual(
-        gates, levels,
+        gates,
+        levels,
         {name: value.numpy() for name, value in quantise_latents(rule.codes(), latents).items()},
         {name: code.step for name, code in rule.codes().items()},
         {name: value.numpy() for name, value in decoders.items()},
-    )  # fmt: skip
+    )
     return trained, apply_delta(Scene(scene, layout), Delta((residual,))).gaussians, active
 
 
@@ -206,8 +208,12 @@ def test_zero_latents_change_nothing() -> None:
 def test_latents_follow_width_and_degree() -> None:
     latents = init_latents(Coded(), make_scene(5, bases=1).map(torch.from_numpy))
     assert {n: tuple(v.shape) for n, v in latents.items()} == {
-        "means": (5, 3), "quats": (5, 6), "scales": (5, 8), "opacities": (5, 1), "sh0": (5, 3)
-    }  # fmt: skip
+        "means": (5, 3),
+        "quats": (5, 6),
+        "scales": (5, 8),
+        "opacities": (5, 1),
+        "sh0": (5, 3),
+    }
     empty = init_latents(Coded(), make_scene(0, bases=9).map(torch.from_numpy))
     assert tuple(empty["shN"].shape) == (0, 4)
     decoders = Coded().init_decoders(make_scene(0, bases=9).map(torch.from_numpy), torch.Generator().manual_seed(0))

@@ -96,4 +96,3 @@ def test_a_plugin_whose_declaration_imports_torch_fails_exactly_that(
         sys.modules.pop("gsstream_heavy_plugin", None)
     assert set(found) == {"check_cheap_spec"}
     assert "imports torch" in found["check_cheap_spec"]
-

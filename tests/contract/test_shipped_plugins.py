@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from gsstream.cli.main import run_command
-from gsstream.plugins.catalog import load_catalog
+from gsstream.discovery.catalog import load_catalog
 from gsstream.testing.kit import run_checks
 from gsstream.testing.method_driver import around
 
@@ -38,11 +38,17 @@ ANCHORS = {"epochs": 1, "measure": "anchor", "step": 0.02, "rotation_step": 0.00
 CACHE = {"epochs": 1, "levels": 4, "entries": 8, "width": 8, "lr": 0.02, "box": 0.0}
 #: Whole method -> settings under which something moves, and is born, in three frames of one or two passes.
 EAGER: dict[str, list[dict[str, Any]]] = {
-    "queen": [{}, {
-        "growth": {"every": 1, "start": 0, "stop": 1, "grad_threshold": 1e-6, "max_added": 20}, "rows": "dynamic",
-        "change": {"dynamic": 1e-8}, "rate": 1e-3, "sigma": 1e-4,
-    }],
-}  # fmt: skip
+    "queen": [
+        {},
+        {
+            "growth": {"every": 1, "start": 0, "stop": 1, "grad_threshold": 1e-6, "max_added": 20},
+            "rows": "dynamic",
+            "change": {"dynamic": 1e-8},
+            "rate": 1e-3,
+            "sigma": 1e-4,
+        },
+    ],
+}
 #: Part of a slot -> settings, beside the default, of which each changes what it does.
 OTHERWISE: dict[tuple[str, str], list[dict[str, Any]]] = {
     ("gate", "binary-ste"): [{"noise": "none"}, {"temperature": 2.0}, {"clamp_gradient": True}],
@@ -60,9 +66,7 @@ ROWS += [(slot, settings) for slot, rows in OTHERWISE.items() for settings in ro
 FOUND = load_catalog().entries
 
 
-@pytest.mark.parametrize(
-    ("slot", "settings"), [pytest.param(*row, id=row[0][1]) for row in ROWS if row[0] in FOUND]
-)
+@pytest.mark.parametrize(("slot", "settings"), [pytest.param(*row, id=row[0][1]) for row in ROWS if row[0] in FOUND])
 def test_under_settings_that_matter_it_keeps_the_contract(slot: tuple[str, str], settings: dict[str, Any]) -> None:
     target = load_catalog().resolve(*slot)
     part = target(target.Config.model_validate(settings))

@@ -247,9 +247,12 @@ class TestDelta:
 
     def delta(self, **changes: object) -> Delta:
         fields: dict = {
-            "gates": np.array([0, 7, 5], np.uint8), "num_levels": 10, "symbols": {"means": np.ones((3, 3), np.int32)},
-            "steps": {"means": 0.1}, "decoders": {},
-        }  # fmt: skip
+            "gates": np.array([0, 7, 5], np.uint8),
+            "num_levels": 10,
+            "symbols": {"means": np.ones((3, 3), np.int32)},
+            "steps": {"means": 0.1},
+            "decoders": {},
+        }
         return Delta((Residual(**(fields | changes)),))
 
     def test_by_hand(self) -> None:
@@ -295,15 +298,23 @@ class TestDelta:
         with pytest.raises(ShapeError, match=message):
             apply_delta(Scene(make_scene(5), self.layout()), self.delta(**changes))
 
-    @pytest.mark.parametrize("kinds", [
-        (Residual, Motion), (RowEdit, Motion), (RowEdit, Residual), (Residual, Residual), (RowEdit, RowEdit),
-        (Motion, RowEdit, Motion),
-    ])  # fmt: skip
+    @pytest.mark.parametrize(
+        "kinds",
+        [
+            (Residual, Motion),
+            (RowEdit, Motion),
+            (RowEdit, Residual),
+            (Residual, Residual),
+            (RowEdit, RowEdit),
+            (Motion, RowEdit, Motion),
+        ],
+    )
     def test_changes_in_another_order_are_refused(self, kinds: tuple[type, ...]) -> None:
         some = {
             Motion: Motion(1.0, 1, np.zeros(1, np.uint8), np.zeros((0, 6), np.int32)),
-            Residual: self.delta().residual, RowEdit: RowEdit(removed=np.array([0])),
-        }  # fmt: skip
+            Residual: self.delta().residual,
+            RowEdit: RowEdit(removed=np.array([0])),
+        }
         names = ", ".join(kind.__name__ for kind in kinds)
         wanted = f"motions, then one field, then one residual, then one change of rows; got {names}"
         with pytest.raises(ShapeError, match=wanted):
@@ -349,10 +360,14 @@ class TestErrors:
         error = ComponentError("boom", slot="gate", part="g", distribution="d 1.0", frame=3, iteration=5)
         assert str(error) == "gate 'g' (from d 1.0) failed at frame 3, iteration 5: boom"
 
-    @pytest.mark.parametrize("error", [
-        UnknownName("method", "a", ["b"]), PacketError("bad", 3),
-        ComponentError("boom", slot="gate", part="g", distribution="d", frame=1),
-    ])  # fmt: skip
+    @pytest.mark.parametrize(
+        "error",
+        [
+            UnknownName("method", "a", ["b"]),
+            PacketError("bad", 3),
+            ComponentError("boom", slot="gate", part="g", distribution="d", frame=1),
+        ],
+    )
     def test_errors_cross_processes(self, error: GsstreamError) -> None:
         again = pickle.loads(pickle.dumps(error))
         assert str(again) == str(error)

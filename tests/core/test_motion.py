@@ -1,6 +1,5 @@
 """Motions as geometry: what stays, what turns, how one frame predicts the next, and what becomes of groups."""
 
-
 from __future__ import annotations
 
 import dataclasses
@@ -352,6 +351,7 @@ def test_misfits_are_refused_in_words() -> None:
         with pytest.raises(ShapeError, match=message):
             play(scene, wrong)
     assert isinstance(scene.groups, Groups)
+
 
 ROWS, CELL = 300, 0.25
 

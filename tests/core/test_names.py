@@ -56,9 +56,13 @@ def test_a_stream_with_hostile_ids_is_neither_read_nor_written(name: str) -> Non
 @pytest.mark.parametrize("name", [name for name in HOSTILE if name], ids=ascii)
 def test_a_calibration_with_hostile_ids_is_refused(name: str, tmp_path: Path) -> None:
     camera = {
-        "id": name, "width": 8, "height": 8, "K": np.diag([8.0, 8.0, 1.0]).tolist(), "w2c": np.eye(4).tolist(),
+        "id": name,
+        "width": 8,
+        "height": 8,
+        "K": np.diag([8.0, 8.0, 1.0]).tolist(),
+        "w2c": np.eye(4).tolist(),
         "frames": "a/%06d.png",
-    }  # fmt: skip
+    }
     data = {"schema": "opencv-multiview-1", "frames": 1, "cameras": [camera]}
     (tmp_path / "cameras.json").write_text(json.dumps(data))
     with pytest.raises(SourceError, match="camera id"):
@@ -82,11 +86,11 @@ def test_prepare_writes_nothing_for_a_hostile_rig(tmp_path: Path) -> None:
 
     raw = tmp_path / "raw"
     raw.mkdir()
-    cameras = [{"id": name, "width": 8, "height": 8, "K": [], "w2c": [], "frames": "a/%06d.png"}
-               for name in ("../pwned", "pwned_abs")]  # fmt: skip
-    (raw / "cameras.json").write_text(
-        json.dumps({"schema": "opencv-multiview-1", "frames": 1, "cameras": cameras})
-    )
+    cameras = [
+        {"id": name, "width": 8, "height": 8, "K": [], "w2c": [], "frames": "a/%06d.png"}
+        for name in ("../pwned", "pwned_abs")
+    ]
+    (raw / "cameras.json").write_text(json.dumps({"schema": "opencv-multiview-1", "frames": 1, "cameras": cameras}))
     with pytest.raises(SourceError, match="camera id"):
         prepare(raw, tmp_path / "out", PrepareOptions(), lambda _: None)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["raw"]

@@ -22,10 +22,13 @@ def public_names() -> dict[str, list[str]]:
     for door in DOORS:
         module = importlib.import_module(f"gsstream.{door}")
         found[door] = sorted(
-            name for name, value in vars(module).items()
-            if not name.startswith("_") and type(value).__name__ != "module" and name != "annotations"
+            name
+            for name, value in vars(module).items()
+            if not name.startswith("_")
+            and type(value).__name__ != "module"
+            and name != "annotations"
             and (getattr(value, "__module__", "gsstream") or "").startswith("gsstream")
-        )  # fmt: skip
+        )
     return found
 
 

@@ -147,10 +147,13 @@ def test_worlds_invert_and_follow_each_other(first, second):
 def scene(rng: np.random.Generator, rest: int) -> Gaussians:
     number = 60
     return Gaussians(
-        means=0.5 * rng.normal(size=(number, 3)), quats=rng.normal(size=(number, 4)),
-        scales=np.log(rng.uniform(0.03, 0.3, (number, 3))), opacities=rng.normal(size=number),
-        sh0=rng.normal(size=(number, 1, 3)), shN=0.5 * rng.normal(size=(number, rest, 3)),
-    )  # fmt: skip
+        means=0.5 * rng.normal(size=(number, 3)),
+        quats=rng.normal(size=(number, 4)),
+        scales=np.log(rng.uniform(0.03, 0.3, (number, 3))),
+        opacities=rng.normal(size=number),
+        sh0=rng.normal(size=(number, 1, 3)),
+        shN=0.5 * rng.normal(size=(number, rest, 3)),
+    )
 
 
 def picture(gaussians: Gaussians, cameras: Cameras, view: int) -> np.ndarray:
@@ -194,11 +197,20 @@ def test_poses_that_the_calibration_rounded_stay_as_they_are_to_the_grid():
     assert np.abs(snap_cameras(cameras).viewmats - cameras.viewmats).max() <= 2.0**-30
 
 
-@pytest.mark.parametrize("fault", [
-    {"scale": 0.0}, {"scale": -1.0}, {"scale": np.inf}, {"scale": np.nan}, {"offset": (0.0, np.nan, 0.0)},
-    {"offset": (0.0,)}, {"rotation": (1.0,) * 9}, {"rotation": (-1.0, 0, 0, 0, 1, 0, 0, 0, 1)},
-    {"rotation": IDENTITY.rotation[:8]},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "fault",
+    [
+        {"scale": 0.0},
+        {"scale": -1.0},
+        {"scale": np.inf},
+        {"scale": np.nan},
+        {"offset": (0.0, np.nan, 0.0)},
+        {"offset": (0.0,)},
+        {"rotation": (1.0,) * 9},
+        {"rotation": (-1.0, 0, 0, 0, 1, 0, 0, 0, 1)},
+        {"rotation": IDENTITY.rotation[:8]},
+    ],
+)
 def test_what_is_no_similarity_is_refused(fault):
     with pytest.raises(ShapeError, match="world"):
         replace(IDENTITY, **fault).validate()

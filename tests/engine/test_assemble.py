@@ -1,6 +1,5 @@
 """Recipe + catalogue -> live parts; which slots there are, and what a run calls itself."""
 
-
 from __future__ import annotations
 
 import dataclasses
@@ -12,13 +11,13 @@ from pydantic import ValidationError
 from gsstream.core.errors import InputError, PluginUnavailable, RecipeError
 from gsstream.core.kinds import CONTRACTS, METHOD_SLOTS, PART_KINDS
 from gsstream.core.part import Part
+from gsstream.discovery.builtin import gsstream_components
+from gsstream.discovery.catalog import Catalog, load_catalog
+from gsstream.discovery.discovery import Discovered
 from gsstream.engine.assembly.assemble import SLOTS, Assembly, assemble
 from gsstream.engine.assembly.choose_renderer import SlowRendererWarning
 from gsstream.engine.assembly.title import title
 from gsstream.parts.render.reference import ReferenceRenderer
-from gsstream.plugins.builtin import gsstream_components
-from gsstream.plugins.catalog import Catalog, load_catalog
-from gsstream.plugins.discovery import Discovered
 from gsstream.recipe.load import ResolvedRecipe, resolve_recipe
 from gsstream.recipe.model import ComponentRef, Recipe
 from gsstream.spec import ComponentSpec
@@ -150,6 +149,7 @@ def test_kinds_that_are_not_in_the_table_are_refused() -> None:
         ComponentSpec(kind="metric", name="x", target="a:B", summary="nothing reads this kind")
     with pytest.raises(TypeError, match="'source' has no contract class"):
         PART_KINDS["source"].contract_class()
+
 
 #: method, changes, name.
 NAMES = (

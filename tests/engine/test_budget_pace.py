@@ -178,15 +178,17 @@ def made(found: FramePlan, costs: Costs, slower: float = 1.0) -> Made:
 
 def past(frame: Made, costs: Costs) -> Past:
     """What the planner knows of a frame."""
-    return Past(
-        1, frame.epochs, 100, costs.before, frame.optimise, costs.after, 3e-4, 1.0, 6.0, 0.0, 9000, 9000
-    )  # fmt: skip
+    return Past(1, frame.epochs, 100, costs.before, frame.optimise, costs.after, 3e-4, 1.0, 6.0, 0.0, 9000, 9000)
 
 
 COSTS = st.builds(
-    Costs, before=st.floats(0.01, 2), first=st.floats(0, 0.5), view=st.floats(0.01, 0.5), after=st.floats(0, 2),
+    Costs,
+    before=st.floats(0.01, 2),
+    first=st.floats(0, 0.5),
+    view=st.floats(0.01, 0.5),
+    after=st.floats(0, 2),
     views=st.integers(1, 30),
-)  # fmt: skip
+)
 
 
 @given(COSTS, st.floats(0, 1), st.floats(1, 50), st.floats(0.7, 1.0))

@@ -35,11 +35,20 @@ from gsstream.recipe.model import Stream
 
 SECONDS = st.floats(1e-3, 10)
 PASTS = st.builds(
-    Past, frame=st.just(1), epochs=st.floats(0.1, 30), candidates=st.integers(1, 10_000), before=SECONDS,
-    optimise=SECONDS, after=SECONDS, weight=st.floats(MIN_WEIGHT, MAX_WEIGHT), step_scale=st.floats(1, 4),
-    threshold=st.floats(0, 24), estimate=st.floats(0, 1e5), untrimmed=st.integers(16, 100_000),
+    Past,
+    frame=st.just(1),
+    epochs=st.floats(0.1, 30),
+    candidates=st.integers(1, 10_000),
+    before=SECONDS,
+    optimise=SECONDS,
+    after=SECONDS,
+    weight=st.floats(MIN_WEIGHT, MAX_WEIGHT),
+    step_scale=st.floats(1, 4),
+    threshold=st.floats(0, 24),
+    estimate=st.floats(0, 1e5),
+    untrimmed=st.integers(16, 100_000),
     size=st.integers(16, 100_000),
-)  # fmt: skip
+)
 HISTORIES = st.lists(PASTS, max_size=8)
 STREAMS = st.builds(Stream, epochs=st.integers(1, 30), change_threshold=st.sampled_from([0.0, 6.0]))
 USUAL = Past(1, 20.0, 1000, 0.1, 1.0, 0.1, 3e-4, 1.0, 6.0, 9000.0, 9900, 9500)
@@ -130,8 +139,10 @@ def test_a_size_plans_within_it_and_leaves_time_alone(stream: Stream, history: l
 def test_without_limits_the_recipe_is_the_plan(stream: Stream, history: list[Past]) -> None:
     found = plan(Budget(), stream, history)
     assert (found.epochs, found.change_threshold, found.rd_lambda) == (
-        stream.epochs, stream.change_threshold, stream.rd_lambda
-    )  # fmt: skip
+        stream.epochs,
+        stream.change_threshold,
+        stream.rd_lambda,
+    )
     assert (found.step_scale, found.max_bytes, found.seconds) == (1.0, None, None)
 
 
@@ -148,9 +159,7 @@ def test_too_few_passes_raise_the_threshold_and_plenty_lower_it_again() -> None:
     assert plan(tight, Stream(), [poor, replace(poor, threshold=0.0)]).change_threshold == 3.0
 
 
-@pytest.mark.parametrize(
-    ("limit", "scale"), [(4.0, 1.0), (1.0, (TIME_MARGIN - 0.2) / 2), (0.1, MIN_PART_SCALE)]
-)
+@pytest.mark.parametrize(("limit", "scale"), [(4.0, 1.0), (1.0, (TIME_MARGIN - 0.2) / 2), (0.1, MIN_PART_SCALE)])
 def test_where_no_residual_is_learned_motion_and_growth_make_the_passes_that_fit(limit: float, scale: float) -> None:
     """Their whole passes take two seconds, all else 0.2; two frames before made them all, the last a half of them."""
     whole = replace(USUAL, epochs=0.0, optimise=0.0, before=1.7, after=0.5, parts=2.0)

@@ -31,9 +31,13 @@ def scene(seed: int, *, spread: float = 4.0, share: float = 0.7, births: int = 0
     added = None
     if births:
         colour = Gaussians(
-            means=g.normal(size=(births, 3)), quats=g.normal(size=(births, 4)), scales=g.normal(size=(births, 3)),
-            opacities=g.normal(size=births), sh0=g.normal(size=(births, 1, 3)), shN=np.zeros((births, 0, 3)),
-        ).map(lambda value: np.asarray(value, np.float32))  # fmt: skip
+            means=g.normal(size=(births, 3)),
+            quats=g.normal(size=(births, 4)),
+            scales=g.normal(size=(births, 3)),
+            opacities=g.normal(size=births),
+            sh0=g.normal(size=(births, 1, 3)),
+            shN=np.zeros((births, 0, 3)),
+        ).map(lambda value: np.asarray(value, np.float32))
         added = add_as_nodes(colour, np.zeros(births, np.uint8), NODES)
     residual = Residual(gates, 10, symbols, dict.fromkeys(symbols, 0.5), quantise_decoders(decoders))
     delta = Delta((residual,)).with_row_edit(RowEdit(added))

@@ -113,7 +113,9 @@ def test_a_run_has_a_smaller_key_packet_that_shows_nearly_the_same() -> None:
         scene = scene_of(packet).map(torch.from_numpy)
         error = 0.0
         for view in range(3):
-            shown = encoder.parts.renderer.render(scene, frames()[0].cameras, view, encoder.parts.background).image
+            shown = encoder.assembly.renderer.render(
+                scene, frames()[0].cameras, view, encoder.assembly.background
+            ).image
             error += float((shown - torch.from_numpy(frames()[0].images[view])).square().mean())
         errors.append(error)
     assert errors[1] < 1.3 * errors[0]
@@ -124,7 +126,7 @@ def test_what_moves_stays_within_reach() -> None:
     packet, _ = key_packet(0.0)
     scene, codes = scene_of(packet).map(torch.from_numpy), []
     for rate in (0.0, 1e6):
-        parts, rng = key_packet(rate)[1].parts, Rng(0)
+        parts, rng = key_packet(rate)[1].assembly, Rng(0)
         found = rd_quantise(parts, scene, frames()[0], None, rng)
         assert torch.equal(found.means, scene.means)
         codes.append({name: to_codes(name, getattr(found, name).numpy(), bits) for name, bits in KEY_BITS.items()})
@@ -141,13 +143,13 @@ def test_sensitivity_is_what_a_code_changes(name: str) -> None:
     packet, encoder = key_packet(0.0)
     scene, frame = scene_of(packet).map(torch.from_numpy), frames()[0]
     sensitivity = sum(
-        code_sensitivity(encoder.parts, scene, frame, None, Rng(seed).stream("a", 0))[0][name] for seed in range(24)
+        code_sensitivity(encoder.assembly, scene, frame, None, Rng(seed).stream("a", 0))[0][name] for seed in range(24)
     )
     sensitivity = sensitivity / 24
     row, column = np.unravel_index(int(sensitivity.argmax()), sensitivity.shape)
     bits = KEY_BITS[name]
     flat = getattr(scene, name).numpy().reshape(len(scene), -1)
-    images, behind = [], encoder.parts.background
+    images, behind = [], encoder.assembly.background
     for shift in (-0.5, 0.5):
         if name.startswith("sh"):
             codes = color_codes(flat, bits)
@@ -157,7 +159,7 @@ def test_sensitivity_is_what_a_code_changes(name: str) -> None:
             values = flat.copy()
             values[row, column] += shift * 2.0**-bits
         other = Gaussians(**{**dict(scene.items()), name: torch.from_numpy(values).reshape(getattr(scene, name).shape)})
-        images.append([encoder.parts.renderer.render(other, frame.cameras, v, behind).image for v in range(3)])
+        images.append([encoder.assembly.renderer.render(other, frame.cameras, v, behind).image for v in range(3)])
     exact = sum(float((a - b).square().sum()) for a, b in zip(*images, strict=True))
     assert sensitivity[row, column] == pytest.approx(exact, rel=0.5)
 
@@ -166,4 +168,4 @@ def test_a_scene_without_gaussians_stays_one() -> None:
     """A refinement of a few iterations may prune everything: it was refused with an error of numpy's."""
     packet, encoder = key_packet(0.1)
     scene = scene_of(packet).map(torch.from_numpy).rows(torch.zeros(0, dtype=torch.int64))
-    assert len(rd_quantise(encoder.parts, scene, frames()[0], None, Rng(0))) == 0
+    assert len(rd_quantise(encoder.assembly, scene, frames()[0], None, Rng(0))) == 0

@@ -11,12 +11,12 @@ import torch
 
 from gsstream.core.errors import InputError, PluginUnavailable, RecipeError
 from gsstream.core.part import PartConfig
+from gsstream.discovery.catalog import Catalog, load_catalog
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.assembly.choose_renderer import VARIABLE, choose_renderer
 from gsstream.parts.loss.photometric import ReferenceLoss
 from gsstream.parts.optimiser.adam import ReferenceAdam
 from gsstream.parts.render.base import Renderer
-from gsstream.plugins.catalog import Catalog, load_catalog
 from gsstream.recipe.load import resolve_recipe
 
 GPU = "NVIDIA GeForce RTX 4090"

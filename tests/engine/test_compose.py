@@ -12,22 +12,25 @@ import pytest
 from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError
 from gsstream.core.kinds import METHOD_SLOTS
+from gsstream.discovery.catalog import load_catalog
 from gsstream.encode import Encoder, encoder_for, encoder_for_rig, open_recording
 from gsstream.engine.assembly.assemble import with_live
 from gsstream.engine.method.parts import PartsMethod
 from gsstream.method.static import Hold
 from gsstream.parts.motion.none import Still
 from gsstream.parts.motion.rigid import Rigid
-from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import ResolvedRecipe
 from gsstream.recipe.model import Recipe
 from gsstream.recipe.save import to_yaml
 
 WORLD = "synthetic:frames=3&views=3&width=32&height=24&supersample=1"
 TINY: dict[str, Any] = {
-    "first_frame.max_iterations": 8, "first_frame.max_points": 200, "first_frame.points": "recording",
-    "first_frame.prune_error": 0, "stream.epochs": 1,
-}  # fmt: skip
+    "first_frame.max_iterations": 8,
+    "first_frame.max_points": 200,
+    "first_frame.points": "recording",
+    "first_frame.prune_error": 0,
+    "stream.epochs": 1,
+}
 
 
 def encoder(settings: dict[str, Any], method: str = "dense", **parts: Any) -> Encoder:
@@ -44,18 +47,18 @@ def test_live_parts_make_the_bytes_of_the_same_parts_by_name() -> None:
     """The key packet holds the recipe: a stream of composed parts is resumed by a recipe file, too."""
     named = encoder({"motion": "rigid", "motion.epochs": 3, "confidence": "view-gradient"})
     live = encoder({}, motion=Rigid(Rigid.Config(epochs=3)), confidence="view-gradient")
-    assert live.parts.recipe == named.parts.recipe
+    assert live.assembly.recipe == named.assembly.recipe
     assert packets(live) == packets(named)
 
 
 def test_what_is_not_given_is_the_recipe_of_the_method() -> None:
     own, given = encoder({}, "s2gs-edge"), encoder({}, "s2gs-edge", motion=Still())
     for slot in METHOD_SLOTS:
-        assert (getattr(own.parts, slot) == getattr(given.parts, slot)) == (slot != "motion"), slot
-    assert given.parts.title.startswith("s2gs-edge + motion=still")
+        assert (getattr(own.assembly, slot) == getattr(given.assembly, slot)) == (slot != "motion"), slot
+    assert given.assembly.title.startswith("s2gs-edge + motion=still")
     with open_recording(WORLD) as source:
         rig = encoder_for_rig("s2gs-edge", source.info.train, settings=TINY, motion=Still())
-    assert rig.parts.part("motion") == Still()
+    assert rig.assembly.part("motion") == Still()
 
 
 @pytest.mark.parametrize(
@@ -88,8 +91,8 @@ def test_every_part_that_is_installed_is_called_in_the_recipe_as_in_the_catalogu
 def test_a_part_that_no_plugin_declares_is_called_by_its_class() -> None:
     motion = type("Mine", (Rigid,), {"__module__": "studio"})()
     made = encoder({}, motion=motion)
-    assert made.parts.recipe.motion.name == "studio:Mine"
-    assert re.search(r"studio:Mine\"? +# Python$", to_yaml(made.parts.resolved), re.MULTILINE)
+    assert made.assembly.recipe.motion.name == "studio:Mine"
+    assert re.search(r"studio:Mine\"? +# Python$", to_yaml(made.assembly.resolved), re.MULTILINE)
     assert packets(made)[1] == packets(encoder({}, motion="rigid"))[1]
 
 

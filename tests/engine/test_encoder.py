@@ -34,15 +34,18 @@ from gsstream.play import Playback
 #: A body that moves two pixels a frame: motions have something to say.
 WORLD = "synthetic:frames=6&views=3&width=32&height=24&supersample=1"
 TINY: Mapping[str, Any] = {
-    "first_frame.max_iterations": 40, "first_frame.points": "recording", "first_frame.max_points": 250,
+    "first_frame.max_iterations": 40,
+    "first_frame.points": "recording",
+    "first_frame.max_points": 250,
     "stream.epochs": 1,
     # Images this small and this far off would not miss most of what the cases need.
     "first_frame.prune_error": 0,
-}  # fmt: skip
+}
 GROWING: Mapping[str, Any] = {"growth": "neighbours", "growth.per_frame": 24}
 #: Gaussians are added and pruned in the first two of the three frames, so that all that goes on has to go on exactly.
 REFINING: Mapping[str, Any] = {
-    "stream.refine_frames": 3, "stream.refine_iterations": 6,
+    "stream.refine_frames": 3,
+    "stream.refine_iterations": 6,
 }
 #: Pictures this small hardly say where a group has gone: what holds it back must be weak.
 MOVING: Mapping[str, Any] = {"motion": "rigid", "motion.epochs": 1, "motion.hold": 0.1}
@@ -167,7 +170,7 @@ def test_a_scene_taken_over_is_grouped_as_players_have_it() -> None:
         shift = np.random.default_rng(seed).normal(0, 0.05, player.gaussians.means.shape).astype(np.float32)
         moved = replace(player.gaussians, means=player.gaussians.means + shift)
         with open_recording(WORLD) as source:
-            parts = encoder().parts
+            parts = encoder().assembly
             first = replace(player, scene=replace(player.scene, gaussians=moved))
             state = Encoder(parts, source.info, first_frame=first).encode(frames()[0]).state
         again = rebuild_hierarchy(parts, state.player)
@@ -207,31 +210,31 @@ class BrokenGrowth:
 def test_a_frame_that_fails_leaves_the_encoder_as_it_was(case: str) -> None:
     """Its last part fails, after rendering and learning; with that part mended the packets are the undisturbed ones."""
     made, sent = encoder(case), []
-    sound = made.parts
+    sound = made.assembly
     for frame in frames():
         if frame.index in (1, 4):
             before, player = made.state, made.state.player
             bits = [value.tobytes() for _, value in player.gaussians.items()]
-            made.parts = replace(sound, growth=BrokenGrowth())
+            made.assembly = replace(sound, growth=BrokenGrowth())
             for _ in range(2):
                 with pytest.raises(ComponentError, match=f"'BrokenGrowth' .* failed at frame {frame.index}: "):
                     made.encode(frame)
             assert made.state is before
             assert [value.tobytes() for _, value in made.state.player.gaussians.items()] == bits
-            made.parts = sound
+            made.assembly = sound
         sent.append(made.encode(frame))
     assert packets(sent) == packets(whole(case))
 
 
 def test_frame_0_that_fails_can_be_made_again() -> None:
     made = encoder()
-    sound = made.parts
-    made.parts = replace(sound, loss=BrokenGrowth())
+    sound = made.assembly
+    made.assembly = replace(sound, loss=BrokenGrowth())
     with pytest.raises(ComponentError) as caught:
         made.encode(frames()[0])
     assert (caught.value.slot, caught.value.frame) == ("loss", 0)
     assert made.state is None
-    made.parts = sound
+    made.assembly = sound
     assert made.encode(frames()[0]).packet.data == packets(whole("still"))[0]
 
 

@@ -40,9 +40,16 @@ def rig(width: int, height: int) -> Cameras:
 
 @pytest.mark.parametrize(
     ("width", "factors", "iterations"),
-    [(160, [1], [2000]), (320, [1], [2000]), (639, [1], [2000]), (640, [2, 1], [650, 550]),
-     (1279, [2, 1], [650, 550]), (1352, [4, 2, 1], [500, 500, 400]), (7680, [4, 2, 1], [500, 500, 400])],
-)  # fmt: skip
+    [
+        (160, [1], [2000]),
+        (320, [1], [2000]),
+        (639, [1], [2000]),
+        (640, [2, 1], [650, 550]),
+        (1279, [2, 1], [650, 550]),
+        (1352, [4, 2, 1], [500, 500, 400]),
+        (7680, [4, 2, 1], [500, 500, 400]),
+    ],
+)
 def test_levels_halve_down_to_320_pixels_and_take_up_each_other(width: int, factors: list, iterations: list) -> None:
     pyramid = plan_pyramid(width, 2000, SETTINGS)
     assert [level.factor for level in pyramid.levels] == factors
@@ -95,10 +102,13 @@ def test_widths_are_kept_when_pictures_become_larger() -> None:
     torch.manual_seed(0)
     count = 30
     scene = Gaussians(
-        means=torch.randn(count, 3) * 0.3, quats=torch.nn.functional.normalize(torch.randn(count, 4), dim=1),
-        scales=torch.full((count, 3), math.log(0.01)), opacities=torch.full((count,), -1.0),
-        sh0=torch.rand(count, 1, 3), shN=torch.zeros(count, 0, 3),
-    )  # fmt: skip
+        means=torch.randn(count, 3) * 0.3,
+        quats=torch.nn.functional.normalize(torch.randn(count, 4), dim=1),
+        scales=torch.full((count, 3), math.log(0.01)),
+        opacities=torch.full((count,), -1.0),
+        sh0=torch.rand(count, 1, 3),
+        shN=torch.zeros(count, 0, 3),
+    )
     large = rig(96, 64)
     small, renderer = large.scaled(24, 16), ReferenceRenderer()
     wide = replace(scene, scales=keep_widths(scene, large, 4, 1))
@@ -135,10 +145,13 @@ def drawn(seed: int, rows: int = 200) -> Gaussians[torch.Tensor]:
     rng = np.random.default_rng(seed)
     quats = rng.normal(size=(rows, 4)) * 10 ** rng.uniform(-3, 3, (rows, 1))
     return Gaussians(
-        means=torch.zeros(rows, 3), quats=torch.from_numpy(quats).float(),
-        scales=torch.from_numpy(rng.normal(-3, 2, (rows, 3))).float(), opacities=torch.zeros(rows),
-        sh0=torch.zeros(rows, 1, 3), shN=torch.zeros(rows, 0, 3),
-    )  # fmt: skip
+        means=torch.zeros(rows, 3),
+        quats=torch.from_numpy(quats).float(),
+        scales=torch.from_numpy(rng.normal(-3, 2, (rows, 3))).float(),
+        opacities=torch.zeros(rows),
+        sh0=torch.zeros(rows, 1, 3),
+        shN=torch.zeros(rows, 0, 3),
+    )
 
 
 def covariances(gaussians: Gaussians[torch.Tensor]) -> torch.Tensor:
@@ -186,9 +199,13 @@ NUMBER = 20_000
 
 def disturbed(noise: float, seed: int = 0) -> tuple[Gaussians[torch.Tensor], Gaussians[torch.Tensor]]:
     rows = Gaussians(
-        means=torch.zeros(NUMBER, 3, requires_grad=True), quats=torch.ones(NUMBER, 4), scales=torch.zeros(NUMBER, 3),
-        opacities=torch.zeros(NUMBER), sh0=torch.zeros(NUMBER, 1, 3), shN=torch.zeros(NUMBER, 0, 3),
-    )  # fmt: skip
+        means=torch.zeros(NUMBER, 3, requires_grad=True),
+        quats=torch.ones(NUMBER, 4),
+        scales=torch.zeros(NUMBER, 3),
+        opacities=torch.zeros(NUMBER),
+        sh0=torch.zeros(NUMBER, 1, 3),
+        shN=torch.zeros(NUMBER, 0, 3),
+    )
     run = object.__new__(FirstFrameRun)
     run.settings, run.extent = FirstFrame(noise=noise), 2.0
     run.generator = torch.Generator().manual_seed(seed)

@@ -37,9 +37,11 @@ from gsstream.testing.cases import rig, scene
 
 WORLD = "synthetic:frames=5&views=2&width=32&height=24&supersample=1"
 TINY = {
-    "first_frame.max_iterations": 6, "first_frame.max_points": 120, "stream.epochs": 1,
+    "first_frame.max_iterations": 6,
+    "first_frame.max_points": 120,
+    "stream.epochs": 1,
     "first_frame.prune_error": 0,
-}  # fmt: skip
+}
 BAD = 2
 
 #: slot, function -> (whether frame 2 is made a key packet for it, whether it is called in iterations).
@@ -152,7 +154,7 @@ def encoder(slot: str, make: Callable[[Any, Where], Any], **settings: Any) -> En
     """An encoder in which the part of one slot is replaced."""
     with open_recording(WORLD) as source:
         made = encoder_for("s2gs-edge", source, {**TINY, **settings})
-    made.parts = replace(made.parts, **{slot: make(made.parts.part(slot), made.parts.where)})
+    made.assembly = replace(made.assembly, **{slot: make(made.assembly.part(slot), made.assembly.where)})
     return made
 
 
@@ -188,8 +190,8 @@ def test_what_a_function_raises_is_said_with_its_place_and_costs_one_frame(slot:
             assert error.frame == BAD
             assert (error.iteration is not None) == iterates
             assert made.state is before
-            stream = made.parts.recipe.stream.model_copy(update={"on_error": "repeat"})
-            made.parts = replace(made.parts, recipe=made.parts.recipe.model_copy(update={"stream": stream}))
+            stream = made.assembly.recipe.stream.model_copy(update={"on_error": "repeat"})
+            made.assembly = replace(made.assembly, recipe=made.assembly.recipe.model_copy(update={"stream": stream}))
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always", RepeatedFrameWarning)
             steps.append(made.encode(frame))
@@ -232,18 +234,24 @@ def _births(after: Any, **changes: Any) -> RowEdit:
 ODD = {
     "another type": (lambda after: [1, 2], "expected RowEdit or None, got list"),
     "a node that is not there": (
-        lambda after: _births(after, nodes=np.array([10**6])), "added: expected nodes from 0 to",
+        lambda after: _births(after, nodes=np.array([10**6])),
+        "added: expected nodes from 0 to",
     ),
     "a unit that is not there": (
-        lambda after: _births(after, unit_of=np.array([200], np.uint8)), "expected units 0 to",
+        lambda after: _births(after, unit_of=np.array([200], np.uint8)),
+        "expected units 0 to",
     ),
     "a row that is not there": (lambda after: RowEdit(None, np.array([10**6])), "removed: expected rows from 0 to"),
     "a number that is none": (
-        lambda after: RowEdit(replace(
-            _births(after).added, gaussians=after.gaussians.rows(np.array([0])).map(lambda v: np.full_like(v, np.nan))
-        )), "added: means: expected finite values, got nan",
+        lambda after: RowEdit(
+            replace(
+                _births(after).added,
+                gaussians=after.gaussians.rows(np.array([0])).map(lambda v: np.full_like(v, np.nan)),
+            )
+        ),
+        "added: means: expected finite values, got nan",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("what", ODD)
@@ -262,7 +270,7 @@ def test_growth_is_blamed_for_what_does_not_fit(what: str) -> None:
 
 class TestGuard:
     def part(self) -> Any:
-        return guard("gate", AlwaysOpen(), Where(), encoder("gate", lambda part, _: part).parts.checks)
+        return guard("gate", AlwaysOpen(), Where(), encoder("gate", lambda part, _: part).assembly.checks)
 
     def test_it_stands_in_the_parts_place(self) -> None:
         guarded = self.part()
@@ -281,7 +289,7 @@ class TestGuard:
         assert type(unwrapped(again)) is AlwaysOpen
 
     def test_a_session_goes_with_its_owner_and_not_when_the_collector_comes(self) -> None:
-        renderer, cameras = encoder("gate", lambda part, _: part).parts.renderer, rig()
+        renderer, cameras = encoder("gate", lambda part, _: part).assembly.renderer, rig()
         gc.disable()
         try:
             session = renderer.open(scene(torch.randn(9, 3)), None, cameras, (0.0, 0.0, 0.0))
@@ -297,7 +305,7 @@ class TestGuard:
         assert getattr(self.part(), "no_such_thing", 3) == 3
 
     def test_every_part_of_an_assembly_is_guarded_once(self) -> None:
-        parts = encoder("gate", lambda part, _: part).parts
+        parts = encoder("gate", lambda part, _: part).assembly
         others = "streaming_method", "renderer", "loss", "optimiser"
         for slot in ("structure", "confidence", "gate", "motion", "growth", *others):
             assert isinstance(getattr(parts, slot), Guarded)

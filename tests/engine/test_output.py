@@ -1,6 +1,5 @@
 """The folder of a run: what it may hold, and that one run at a time writes to it."""
 
-
 from __future__ import annotations
 
 import errno
@@ -115,8 +114,11 @@ FULL = "/dev/full"
 
 @pytest.mark.skipif(not Path(FULL).exists(), reason="no device that is always full here")
 def test_a_full_disk_is_one_sentence() -> None:
-    with pytest.raises(OutputError, match=r"No space left on device; make room\. What is complete stays valid"), \
-            disk_errors(Path("out")), open(FULL, "w", buffering=1) as file:  # fmt: skip
+    with (
+        pytest.raises(OutputError, match=r"No space left on device; make room\. What is complete stays valid"),
+        disk_errors(Path("out")),
+        open(FULL, "w", buffering=1) as file,
+    ):
         file.write("x\n")
 
 

@@ -11,7 +11,7 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.picture_size import area_price
-from gsstream.engine.fit import schedule
+from gsstream.engine.fit import constants
 from gsstream.engine.frame0.penalties import add_penalty_grad
 from gsstream.parts.render.reference import ReferenceRenderer
 
@@ -30,9 +30,13 @@ def camera() -> Cameras:
 def scene_of(means: torch.Tensor, scales: torch.Tensor, opacities: torch.Tensor) -> Gaussians[torch.Tensor]:
     count = len(means)
     return Gaussians(
-        means=means, quats=torch.tensor([1.0, 0, 0, 0], dtype=means.dtype).repeat(count, 1), scales=scales,
-        opacities=opacities, sh0=torch.zeros(count, 1, 3), shN=torch.zeros(count, 0, 3),
-    )  # fmt: skip
+        means=means,
+        quats=torch.tensor([1.0, 0, 0, 0], dtype=means.dtype).repeat(count, 1),
+        scales=scales,
+        opacities=opacities,
+        sh0=torch.zeros(count, 1, 3),
+        shN=torch.zeros(count, 0, 3),
+    )
 
 
 def grads(scene: Gaussians[torch.Tensor], price: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -51,8 +55,8 @@ def penalty(scene: Gaussians[torch.Tensor], price: float) -> torch.Tensor:
     distance = (scene.means - torch.tensor([0.0, 0.0, -1.0])).norm(dim=1)
     outline = 2 * math.pi * (255 * opacity).clamp_min(1).log() * (a * b + a * c + b * c) / 3
     covered = (outline * (80 / distance) ** 2 / SIZE**2).sum()
-    sizes = schedule.SCALE_PENALTY * scene.scales.exp().mean() / EXTENT
-    return sizes + schedule.OPACITY_PENALTY * opacity.mean() + price * covered
+    sizes = constants.SCALE_PENALTY * scene.scales.exp().mean() / EXTENT
+    return sizes + constants.OPACITY_PENALTY * opacity.mean() + price * covered
 
 
 @pytest.mark.parametrize("price", [0.0, PRICE])
@@ -90,8 +94,9 @@ def test_extremes_are_finite_and_cost_no_more_than_the_picture() -> None:
         torch.tensor([[-40.0, -40, -40], [20, 20, 20], [0, 0, 0], [3, -30, 3]]),
         torch.tensor([0.0, 60.0, -60.0, 2.0]),
     )
-    by_scale, by_opacity = (with_price - without for with_price, without in zip(
-        grads(scene, PRICE), grads(scene, 0.0), strict=True))  # fmt: skip
+    by_scale, by_opacity = (
+        with_price - without for with_price, without in zip(grads(scene, PRICE), grads(scene, 0.0), strict=True)
+    )
     assert torch.isfinite(by_scale).all()
     assert torch.isfinite(by_opacity).all()
     assert float(by_scale.max()) <= PRICE * math.log(255) * 1.001

@@ -70,7 +70,7 @@ def test_a_still_scene_is_refined_and_a_key_packet_brings_it() -> None:
     assert iterations(made) == [20, 20, 20, 0, 0]
     assert made[3].metrics["key_reason"] == "refined"
     assert [step.state.refinement is None for step in made] == [True, False, False, True, True, True]
-    held_out = HeldOut(encoder().parts.renderer)
+    held_out = HeldOut(encoder().assembly.renderer)
     before, after = (held_out.measure(made[t].state, frames("test")[t])["psnr"] for t in (2, 3))
     assert min(after[name] - before[name] for name in before) > 1, "sixty iterations after ten"
 
@@ -112,14 +112,30 @@ def told(monkeypatch: pytest.MonkeyPatch, efforts: tuple[float, ...]) -> list[st
 def test_iterations_follow_the_packet_but_those_that_complete_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last are needed for the key packet, which is that of their own frame."""
     assert told(monkeypatch, (1,) * 6) == [
-        "key 0", "empty 1", "refined in 1", "empty 2", "refined in 2", "refined in 3", "key 3", "empty 4", "empty 5"
-    ]  # fmt: skip
+        "key 0",
+        "empty 1",
+        "refined in 1",
+        "empty 2",
+        "refined in 2",
+        "refined in 3",
+        "key 3",
+        "empty 4",
+        "empty 5",
+    ]
 
 
 def test_a_skipped_frame_is_not_taken_for_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
     assert told(monkeypatch, (1, 1, 1, 0, 0, 1)) == [
-        "key 0", "empty 1", "refined in 1", "empty 2", "refined in 2", "empty 3", "empty 4", "refined in 5", "key 5"
-    ]  # fmt: skip
+        "key 0",
+        "empty 1",
+        "refined in 1",
+        "empty 2",
+        "refined in 2",
+        "empty 3",
+        "empty 4",
+        "refined in 5",
+        "key 5",
+    ]
 
 
 @pytest.mark.parametrize("every", [1, 2])
@@ -142,14 +158,14 @@ class Broken:
 
 def test_a_refinement_that_fails_leaves_the_encoder_as_it_was() -> None:
     made = encoder()
-    sound = made.parts
+    sound = made.assembly
     made.encode(frames()[0])
     before = made.state
-    made.parts = replace(sound, loss=Broken())
+    made.assembly = replace(sound, loss=Broken())
     with pytest.raises(ComponentError, match=r"failed at frame 1, .*out of order"):
         made.encode(frames()[1])
     assert made.state is before
-    made.parts = sound
+    made.assembly = sound
     sent = [made.encode(frame).packet.data for frame in frames()[1:]]
     assert sent == [step.packet.data for step in whole()[1:]]
 
@@ -157,9 +173,9 @@ def test_a_refinement_that_fails_leaves_the_encoder_as_it_was() -> None:
 def test_a_refinement_that_fails_is_left_out_and_its_iterations_are_made_later() -> None:
     """The packet of the frame is out and sound: a warning says what is missing, and the key packet is put off."""
     made = encoder(**{"stream.on_error": "repeat"})
-    sound, lines = made.parts, []
+    sound, lines = made.assembly, []
     for frame in frames():
-        made.parts = replace(sound, loss=Broken()) if frame.index == 2 else sound
+        made.assembly = replace(sound, loss=Broken()) if frame.index == 2 else sound
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             lines.append(made.encode(frame).metrics)
@@ -190,9 +206,13 @@ def some(number: int, seed: int) -> Gaussians[np.ndarray]:
 def refinement(gaussians: Gaussians[np.ndarray], ancestors: list[int]) -> Refinement:
     count = len(ancestors)
     return Refinement(
-        gaussians.map(torch.from_numpy), torch.zeros(count, dtype=torch.int64), torch.tensor(ancestors), {},
-        DensifyStatistics.zeros(count, torch.device("cpu")), 0,
-    )  # fmt: skip
+        gaussians.map(torch.from_numpy),
+        torch.zeros(count, dtype=torch.int64),
+        torch.tensor(ancestors),
+        {},
+        DensifyStatistics.zeros(count, torch.device("cpu")),
+        0,
+    )
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -220,9 +240,9 @@ def test_rows_that_leave_and_join_are_followed() -> None:
     before, mine, new = some(4, 0), some(4, 1), some(1, 2)
     # Row 1, the last of the first node, leaves, and one is added in its place.
     added = AddedGaussians(new, np.zeros(1, np.int64), np.zeros(1, np.uint8), np.zeros(0, np.int64))
-    after = Gaussians(**{
-        name: np.concatenate([value[[0]], getattr(new, name), value[[2, 3]]]) for name, value in before.items()
-    })
+    after = Gaussians(
+        **{name: np.concatenate([value[[0]], getattr(new, name), value[[2, 3]]]) for name, value in before.items()}
+    )
     after.means[3] += 1.0
     delta = Delta((RowEdit(added, np.array([1], np.int64)),))
     found = track_motion(refinement(mine, [0, 1, 2, 3]), player(before, [2, 2]), player(after, [2, 2], delta))
@@ -249,7 +269,7 @@ def test_the_key_packet_holds_the_refined_scene() -> None:
     assert found[0].iterations == before.iterations + 20 == 60
     ours = quantise_key(nearest_axes(found[0].gaussians).map(lambda t: t.numpy()))
     theirs = step.state.player.gaussians
-    assert np.array_equal(*(
-        np.unique(np.column_stack([v.reshape(len(v), -1) for _, v in g.items()]), axis=0) for g in (ours, theirs)
-    ))
+    assert np.array_equal(
+        *(np.unique(np.column_stack([v.reshape(len(v), -1) for _, v in g.items()]), axis=0) for g in (ours, theirs))
+    )
     assert step.state.player.meta.extra["shown"] == 3

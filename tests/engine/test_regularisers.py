@@ -35,9 +35,13 @@ def wall(depth: torch.Tensor, count: int = 12) -> Gaussians[torch.Tensor]:
     means = torch.stack([x.flatten() * depth, y.flatten() * depth, depth], 1)
     number = count * count
     return Gaussians(
-        means=means, quats=torch.tensor([1.0, 0, 0, 0]).repeat(number, 1), scales=torch.full((number, 3), -2.5),
-        opacities=torch.full((number,), 3.0), sh0=torch.zeros(number, 1, 3), shN=torch.zeros(number, 0, 3),
-    )  # fmt: skip
+        means=means,
+        quats=torch.tensor([1.0, 0, 0, 0]).repeat(number, 1),
+        scales=torch.full((number, 3), -2.5),
+        opacities=torch.full((number,), 3.0),
+        sh0=torch.zeros(number, 1, 3),
+        shN=torch.zeros(number, 0, 3),
+    )
 
 
 def ring(views: int) -> Cameras:
@@ -53,9 +57,17 @@ def ring(views: int) -> Cameras:
 
 @pytest.mark.parametrize(
     ("views", "dropout", "in_line", "in_a_ring"),
-    [(1, 0.2, 1, 1), (2, 0.2, 1, 0), (4, 0.2, 1, 0), (5, 0.2, 1, 0), (6, 0.2, 0, 1), (8, 0.2, 0, 1), (9, 0, 0, 0),
-     (27, 0, 0, 0)],
-)  # fmt: skip
+    [
+        (1, 0.2, 1, 1),
+        (2, 0.2, 1, 0),
+        (4, 0.2, 1, 0),
+        (5, 0.2, 1, 0),
+        (6, 0.2, 0, 1),
+        (8, 0.2, 0, 1),
+        (9, 0, 0, 0),
+        (27, 0, 0, 0),
+    ],
+)
 def test_the_cameras_decide_unless_the_recipe_does(views: int, dropout: float, in_line: int, in_a_ring: int) -> None:
     for cameras, smoothness in ((rig(views), in_line), (ring(views), in_a_ring)):
         chosen = choose_regularisers(FirstFrame(), cameras)

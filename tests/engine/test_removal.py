@@ -89,7 +89,7 @@ def test_the_estimate_is_what_leaving_one_out_changes(renderer: Renderer, expose
 def test_the_reference_and_the_cpu_renderer_agree(renderer: Renderer) -> None:
     scene = fitted().map(torch.from_numpy)
     with open_recording(WORLD) as source:
-        native = encoder_for("s2gs-edge", source, TINY).parts.renderer
+        native = encoder_for("s2gs-edge", source, TINY).assembly.renderer
     one, other = (
         removal_errors(TrainingViews(part, frames()[0], None, BLACK), scene, Rng(3).stream("a", 0), probes=4)[0]
         for part in (renderer, native)

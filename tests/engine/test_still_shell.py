@@ -24,8 +24,11 @@ from gsstream.parts.render.work import FitContext
 
 WORLD = "synthetic:frames=4&views=4&width=48&height=36&supersample=1&motion=3"
 TINY: dict[str, Any] = {
-    "first_frame.max_iterations": 12, "first_frame.max_points": 300, "first_frame.prune_error": 0, "stream.epochs": 2,
-}  # fmt: skip
+    "first_frame.max_iterations": 12,
+    "first_frame.max_points": 300,
+    "first_frame.prune_error": 0,
+    "stream.epochs": 2,
+}
 #: All of the scene may change, and every group may move.
 EVERYTHING: dict[str, Any] = {"stream.change_threshold": 0, "motion": "rigid"}
 
@@ -112,7 +115,7 @@ def test_places_to_copy_are_none_of_the_shell() -> None:
         encoder = encoder_for("dense", source, TINY)
         state = encoder.encode(source.frame(0)).state
         frame = encoder.with_near_plane(source.frame(2))
-        work = EngineContext(encoder.parts, state, frame, FrameLog())
+        work = EngineContext(encoder.assembly, state, frame, FrameLog())
         still = work.shell_rows
         assert bool(still.any())
         places = high_gradient_rows(work, -1.0)  # every Gaussian that any gradient reaches
@@ -125,7 +128,7 @@ def background(settings: dict[str, Any], method: str = "dense", first: PlayerSta
     with open_recording(WORLD) as source:
         encoder = encoder_for(method, source, {**TINY, **settings})
         if first is not None:
-            encoder = Encoder(encoder.parts, source.info, first_frame=first)
+            encoder = Encoder(encoder.assembly, source.info, first_frame=first)
         encoder.encode(source.frame(0))
     return encoder
 
@@ -149,4 +152,4 @@ def test_a_scene_that_is_taken_over_keeps_the_colour_that_it_was_fitted_on() -> 
     first = background({"background": [0.25, 0.5, 1]}).state.player
     taken = background({}, first=first)
     assert taken.state.player.meta.background == (0.25, 0.5, 1)
-    assert taken.parts.recipe.background == "auto", "the recipe of the stream is what was asked for"
+    assert taken.assembly.recipe.background == "auto", "the recipe of the stream is what was asked for"

@@ -14,17 +14,19 @@ from similar_worlds import world
 from gsstream.core.errors import OutputError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.world import IDENTITY
+from gsstream.discovery.catalog import load_catalog
 from gsstream.encode import Encoder, assemble, encoder_for, open_recording, recipe_for
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.frame0.reproject import to_stream_coordinates
 from gsstream.packet import KeyState, PlayerState, StreamWriter, decode_packet, encode_key
 from gsstream.player.render import render
-from gsstream.plugins.catalog import load_catalog
 
 WORLD = "synthetic:frames=2&views=3&width=32&height=24&supersample=1"
 TINY: Mapping[str, Any] = {
-    "first_frame.max_iterations": 12, "first_frame.max_points": 250, "stream.epochs": 1,
-}  # fmt: skip
+    "first_frame.max_iterations": 12,
+    "first_frame.max_points": 250,
+    "stream.epochs": 1,
+}
 
 
 def begun(method: str, settings: Mapping[str, Any] | None = None, first: PlayerState | None = None) -> PlayerState:
@@ -82,9 +84,12 @@ def test_an_octree_lays_its_grid_on_a_scene_that_had_none() -> None:
 
 SOURCE = "synthetic:frames=2&views=3&width=32&height=24&supersample=1"
 SMALL = {
-    "first_frame.max_iterations": 12, "first_frame.max_points": 250, "stream.epochs": 1,
+    "first_frame.max_iterations": 12,
+    "first_frame.max_points": 250,
+    "stream.epochs": 1,
     "first_frame.points": "recording",
-}  # fmt: skip
+}
+
 
 @cache
 def first(method: str = "s2gs-edge") -> PlayerState:

@@ -16,12 +16,12 @@ from rigs import inwards, looking, parallel
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Arrival, Frame
-from gsstream.core.signs import Signs
+from gsstream.core.progress import ProgressDisplay
+from gsstream.discovery.catalog import load_catalog
 from gsstream.encode import assemble, recipe_for
 from gsstream.engine.run.few_cameras import AROUND, ONE_SIDE, expectation, first_frame_summary, widest_gap
 from gsstream.engine.run.live import COUNTED, latency_lines, latency_words, live_metrics
 from gsstream.engine.run.progress import RunProgress
-from gsstream.plugins.catalog import load_catalog
 
 
 class Clock:
@@ -79,16 +79,16 @@ def test_a_fast_frame_0_says_nothing_of_time(capsys) -> None:
 def test_work_that_says_nothing_is_shown_every_few_seconds(capsys: pytest.CaptureFixture[str]) -> None:
     """The clock runs a thousand times too fast; the thread that looks at it does not."""
     start = time.monotonic()
-    with Signs(False, lambda: 1000 * (time.monotonic() - start)) as signs:
-        signs.tell("looking for points", 3, 50)
+    with ProgressDisplay(False, lambda: 1000 * (time.monotonic() - start)) as display:
+        display.tell("looking for points", 3, 50)
         deadline = time.monotonic() + 60
         said = ""
         while said.count("\n") < 2 and time.monotonic() < deadline:
             time.sleep(0.05)
             said += capsys.readouterr().err
     assert re.fullmatch(r"(looking for points 3/50, [\d.]+ (seconds|minutes) on this one\n)+", said)
-    with Signs(True, lambda: 1000 * time.monotonic()) as signs:
-        signs.tell("looking for points", 3, 50)
+    with ProgressDisplay(True, lambda: 1000 * time.monotonic()) as display:
+        display.tell("looking for points", 3, 50)
         time.sleep(0.6)
     assert capsys.readouterr().err == ""
 
@@ -124,8 +124,13 @@ def test_few_or_distant_cameras_are_told_what_to_expect() -> None:
 
 def test_the_line_names_what_was_done_and_why() -> None:
     found = line(inwards(6, 360))
-    for part in ("seeds: the recording", "the mean of its images", "256 large seeds", "dropout 0.2, because 6 cameras",
-                 "smoothness of depth 1, because 6 cameras around a room"):  # fmt: skip
+    for part in (
+        "seeds: the recording",
+        "the mean of its images",
+        "256 large seeds",
+        "dropout 0.2, because 6 cameras",
+        "smoothness of depth 1, because 6 cameras around a room",
+    ):
         assert part in found
     many = line(inwards(12, 360))
     assert "dropout" not in many
@@ -154,10 +159,16 @@ def latency_line(index: int, latency: float | None, policy: str | None = None) -
 @pytest.mark.parametrize(
     ("index", "effort", "absent", "policy"),
     [
-        (3, 1.0, (), None), (3, 0.5, (), "hurried"), (3, 0.0, (), "dropped"), (3, 1.0, ("b",), "held"),
-        (3, 0.5, ("b",), "hurried"), (3, 0.0, ("b",), "missing"), (0, 0.0, (), None), (0, 0.5, (), None),
+        (3, 1.0, (), None),
+        (3, 0.5, (), "hurried"),
+        (3, 0.0, (), "dropped"),
+        (3, 1.0, ("b",), "held"),
+        (3, 0.5, ("b",), "hurried"),
+        (3, 0.0, ("b",), "missing"),
+        (0, 0.0, (), None),
+        (0, 0.5, (), None),
     ],
-)  # fmt: skip
+)
 def test_a_frame_has_one_policy_and_frame_0_none(
     index: int, effort: float, absent: tuple[str, ...], policy: str | None
 ) -> None:

@@ -1,6 +1,5 @@
 """Evaluation, summaries, contact sheets and plots, on streams small enough to work out by hand."""
 
-
 from __future__ import annotations
 
 import itertools
@@ -48,10 +47,12 @@ def make_stream(path):
     number = 40
     scene = Gaussians(
         means=(0.5 * rng.normal(size=(number, 3))).astype(np.float32),
-        quats=np.tile(np.float32([1, 0, 0, 0]), (number, 1)), scales=np.full((number, 3), -2, np.float32),
-        opacities=np.full(number, 2, np.float32), sh0=rng.normal(size=(number, 1, 3)).astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (number, 1)),
+        scales=np.full((number, 3), -2, np.float32),
+        opacities=np.full(number, 2, np.float32),
+        sh0=rng.normal(size=(number, 1, 3)).astype(np.float32),
         shN=np.zeros((number, 0, 3), np.float32),
-    )  # fmt: skip
+    )
     meta = StreamMeta("dense", "test", {}, rig.select([0]), rig.select([1, 2]), 30.0, (0.3, 0.3, 0.3))
     layout = Layout(np.int32([2, 18, 10, 10]), np.zeros(number, np.uint8), np.float32([1]))
     jump = np.zeros((2, 3), np.int32)
@@ -145,12 +146,21 @@ def records():
     first = FrameRecord(0, {"x": 30.0, "y": 32.0}, bytes={"layout": 500, "means": 99_500}, seconds={"root": 60.0})
     later = [
         FrameRecord(
-            t, {"x": 30.0 - t, "y": 31.0 - t}, {"x": 0.9}, {"x": 20.0} if t > 1 else {},
-            {"gates": 1000 * t, "header": 16}, {"confidence": 0.5, "optimise": 1.5}, 10 * t, 100, t, 10, 100.0 * t,
+            t,
+            {"x": 30.0 - t, "y": 31.0 - t},
+            {"x": 0.9},
+            {"x": 20.0} if t > 1 else {},
+            {"gates": 1000 * t, "header": 16},
+            {"confidence": 0.5, "optimise": 1.5},
+            10 * t,
+            100,
+            t,
+            10,
+            100.0 * t,
             {"x": 10.0 * t} if t > 1 else {},
         )
         for t in (1, 2, 3)
-    ]  # fmt: skip
+    ]
     return [first, *later]
 
 
@@ -184,9 +194,14 @@ def test_what_was_not_measured_is_a_dash():
 def test_records_round_trip_and_survive_a_killed_run(tmp_path):
     path = tmp_path / "metrics.jsonl"
     line = {
-        "frame": 1, "psnr": {"x": 30.5, "y": None}, "psnr_changed": {"x": 20.5, "y": None}, "bytes": {"gates": 7},
-        "novelty": [1, 2], "num_gates": 3, "open_gates": [5, 4],
-    }  # fmt: skip
+        "frame": 1,
+        "psnr": {"x": 30.5, "y": None},
+        "psnr_changed": {"x": 20.5, "y": None},
+        "bytes": {"gates": 7},
+        "novelty": [1, 2],
+        "num_gates": 3,
+        "open_gates": [5, 4],
+    }
     path.write_text(json.dumps({"frame": 0}) + "\n\n" + json.dumps(line) + "\n" + '{"frame": 2, "psn')
     read = read_records(tmp_path)
     assert [r.frame for r in read] == [0, 1]
@@ -227,10 +242,14 @@ def test_a_frame_written_again_after_resuming_counts_once(tmp_path):
 
 
 BAD = [
-    ("", "no frame"), ('{"psnr": {}}\n{"frame": 1}', ":1:"), ("[]\n{}", ":1:"),
+    ("", "no frame"),
+    ('{"psnr": {}}\n{"frame": 1}', ":1:"),
+    ("[]\n{}", ":1:"),
     ('{"frame": 0}\n{"fra\n{"frame": 1}', ":2:"),
-    ('{"frame": 0}\n[1]', ":2:"), ('{"frame": 0}\n{"frame": "1"}', ":2:"), ('{"frame": 0, "bytes": 3}', ":1:"),
-]  # fmt: skip
+    ('{"frame": 0}\n[1]', ":2:"),
+    ('{"frame": 0}\n{"frame": "1"}', ":2:"),
+    ('{"frame": 0, "bytes": 3}', ":1:"),
+]
 
 
 @pytest.mark.parametrize(("text", "message"), BAD)
@@ -269,9 +288,7 @@ def test_the_close_up_is_where_most_pixels_changed():
     truth[20:, 30:][draw.random((11, 14)) < 0.6] = 0.5
     rows, columns = most_changed_window(truth, first)
     changed = (truth > 0.1).any(-1)
-    counts = {
-        (y, x): changed[y : y + 10, x : x + 14].sum() for y, x in itertools.product(range(22), range(31))
-    }
+    counts = {(y, x): changed[y : y + 10, x : x + 14].sum() for y, x in itertools.product(range(22), range(31))}
     assert changed[rows, columns].shape == (10, 14)
     assert changed[rows, columns].sum() == max(counts.values())
 
@@ -327,6 +344,7 @@ def test_large_pictures_are_reduced_on_the_sheet_and_close_ups_keep_their_pixels
         row, column = found[0]
         part = sheet[row : row + 100, column : column + 450]
         assert np.abs(part - picture[:100, :450]).max() <= bound
+
 
 CELLS = st.text("abc 0123.-", min_size=1, max_size=12).map(lambda text: text.strip() or "-")
 

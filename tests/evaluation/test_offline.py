@@ -59,8 +59,9 @@ def test_positions_relative_to_an_offset_are_put_back(stream: Path, tmp_path: Pa
     for origin in ("recording", "local"):
         command = ["export", str(stream), "--format", "ply", "--out", str(tmp_path / origin), "--origin", origin]
         assert run_command(command) == 0
-    there, local = (evaluated(capsys, "--ply-sequence", tmp_path / name, "--source", SOURCE) for name in
-                    ("recording", "local"))  # fmt: skip
+    there, local = (
+        evaluated(capsys, "--ply-sequence", tmp_path / name, "--source", SOURCE) for name in ("recording", "local")
+    )
     assert [v["psnr"] for v in local["views"]] == pytest.approx([v["psnr"] for v in there["views"]], abs=2e-3)
 
 
@@ -97,11 +98,13 @@ def test_properties_in_another_order_and_of_other_types_are_read(tmp_path: Path)
     """As other programs write them: a property more, doubles, and no normals."""
     written = make_scene(3, 1)
     columns = {
-        "red": np.zeros(3, np.uint8), "opacity": written.opacities.astype("<f8"),
-        **{f"rot_{i}": written.quats[:, i] for i in range(4)}, **{f"scale_{i}": written.scales[:, i] for i in range(3)},
+        "red": np.zeros(3, np.uint8),
+        "opacity": written.opacities.astype("<f8"),
+        **{f"rot_{i}": written.quats[:, i] for i in range(4)},
+        **{f"scale_{i}": written.scales[:, i] for i in range(3)},
         **{f"f_dc_{i}": written.sh0[:, 0, i] for i in range(3)},
         **{name: written.means[:, i] for i, name in enumerate("zyx")},
-    }  # fmt: skip
+    }
     kinds = {"|u1": "uchar", "<f8": "double", "<f4": "float"}
     head = ["ply", "format binary_little_endian 1.0", "element vertex 3"]
     head += [f"property {kinds[value.dtype.str]} {name}" for name, value in columns.items()]
@@ -138,8 +141,9 @@ def test_names_say_which_frame_a_file_is(tmp_path: Path) -> None:
     for name in ("time_00012.ply", "take2_3.ply", "notes.txt"):
         (tmp_path / name).touch()
     assert {frame: path.name for frame, path in numbered(tmp_path, (".ply",), 2).items()} == {
-        1: "take2_3.ply", 10: "time_00012.ply",
-    }  # fmt: skip
+        1: "take2_3.ply",
+        10: "time_00012.ply",
+    }
     with pytest.raises(InputError, match="a number from 5 on"):
         numbered(tmp_path, (".ply",), 5)
     (tmp_path / "b_12.ply").touch()

@@ -36,10 +36,13 @@ def rectangles() -> Gaussians[FloatArray]:
     count, sides = len(at), np.log(np.concatenate(widths))
     scales = np.column_stack([sides, sides, np.full(count, math.log(1e-3))]).astype(np.float32)
     return Gaussians(
-        means=at, quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)), scales=scales,
-        opacities=np.full(count, 4.0, np.float32), sh0=np.zeros((count, 1, 3), np.float32),
+        means=at,
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        scales=scales,
+        opacities=np.full(count, 4.0, np.float32),
+        sh0=np.zeros((count, 1, 3), np.float32),
         shN=np.zeros((count, 0, 3), np.float32),
-    )  # fmt: skip
+    )
 
 
 def cast(origin: FloatArray, directions: FloatArray) -> FloatArray:

@@ -100,11 +100,13 @@ def test_large_tables_are_coded_within_four_percent_of_their_entropy(tmp_path):
     rng, number = np.random.default_rng(3), 50_000
     widths = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh0": 3}
     scene = Gaussians(
-        means=(rng.random((number, 3)) * 4).astype(np.float32), quats=rng.normal(size=(number, 4)).astype(np.float32),
+        means=(rng.random((number, 3)) * 4).astype(np.float32),
+        quats=rng.normal(size=(number, 4)).astype(np.float32),
         scales=(rng.normal(size=(number, 3)) - 4).astype(np.float32),
         opacities=rng.normal(size=number).astype(np.float32),
-        sh0=rng.normal(size=(number, 1, 3)).astype(np.float32), shN=np.zeros((number, 0, 3), np.float32),
-    )  # fmt: skip
+        sh0=rng.normal(size=(number, 1, 3)).astype(np.float32),
+        shN=np.zeros((number, 0, 3), np.float32),
+    )
     with Playback(make_stream(tmp_path / "meta.gss", 1)) as playback:
         meta = playback.meta
     layout = Layout(np.full(number // 5, 5, np.int32), np.zeros(number, np.uint8), np.float32([1]))

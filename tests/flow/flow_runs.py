@@ -27,13 +27,15 @@ from gsstream.input.recordings.open import DEMO_FOLDER
 #: Six frames of an analytic scene, three training cameras, one test camera.
 WORLD = "synthetic:frames=6&views=3&width=64&height=48&supersample=1"
 TINY = {
-    "first_frame.max_iterations": 30, "first_frame.max_points": 800,
+    "first_frame.max_iterations": 30,
+    "first_frame.max_points": 800,
     "stream.epochs": 3,
     # The analytic scenes stand before black; of so few Gaussians, a shell would be most.
-    "background": [0, 0, 0], "first_frame.shell": False,
+    "background": [0, 0, 0],
+    "first_frame.shell": False,
     # So small and so far off, the images would miss a handful of Gaussians only, too few to say anything.
     "first_frame.prune_error": 0,
-}  # fmt: skip
+}
 
 
 def arguments(
@@ -61,9 +63,13 @@ def finish(*command: str, **environment: str) -> tuple[int, str, str]:
     """(exit code, stdout, stderr) of ``gsstream ...`` in a process that imports everything itself."""
     code = "from gsstream.cli.main import main; main()"
     done = subprocess.run(
-        [sys.executable, "-c", code, *command], env={**os.environ, **environment}, capture_output=True, text=True,
-        timeout=600, check=False,
-    )  # fmt: skip
+        [sys.executable, "-c", code, *command],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
     return done.returncode, done.stdout, done.stderr
 
 

@@ -66,9 +66,7 @@ def world(scale: float = 1.0, offset: Sequence[float] = (0.0, 0.0, 0.0), turn: i
 def encode(parts: Assembly, source: FrameSource) -> tuple[dict[str, float], str]:
     """Encode a recording: means of its quality and bytes, and a hash of all that its packets change."""
     held_out = HeldOut(parts.renderer)
-    encoder = Encoder(
-        parts, source.info, lambda frame: gather_points(source, frame, parts.recipe.first_frame)
-    )
+    encoder = Encoder(parts, source.info, lambda frame: gather_points(source, frame, parts.recipe.first_frame))
     lines, digest = [], hashlib.sha256()
     for index in range(min(parts.recipe.frames or 1 << 30, source.info.num_frames or 1 << 30)):
         step = encoder.encode(source.frame(index))

@@ -13,6 +13,7 @@ from flow_runs import TINY, WORLD
 
 from gsstream.cli.main import run_command
 from gsstream.core.errors import ComponentError, GsstreamError, InputError
+from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.assembly import checks as checks_module
 from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.assembly.checks import Checks, Look, requested_checks
@@ -25,7 +26,6 @@ from gsstream.parts.loss.base import Loss
 from gsstream.parts.optimiser.base import RowOptimiser
 from gsstream.parts.render.base import Renderer, RenderOutput, ScatterSession
 from gsstream.parts.render.reference import ReferenceRenderer
-from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 
 CATALOG = load_catalog()

@@ -52,8 +52,11 @@ class Run(NamedTuple):
 
 #: Gaussians that are far behind everything take no part in motions or growth.
 GROWING = {
-    "growth": "neighbours", "growth__per_frame": 40, "first_frame__shell": True, "background": "auto",
-}  # fmt: skip
+    "growth": "neighbours",
+    "growth__per_frame": 40,
+    "first_frame__shell": True,
+    "background": "auto",
+}
 RUNS = {
     "dense": Run("dense"),
     "s2gs-edge": Run(),
@@ -201,8 +204,13 @@ def test_the_run_folder_is_complete(tmp_path: Path) -> None:
     out = tmp_path / "o"
     encode(out, "--frames", "3", method="s2gs-edge", pictures=True)
     assert {path.name for path in out.iterdir()} == {
-        "stream.gss", "metrics.jsonl", "recipe.yaml", "contact_sheet.png", "frames.png", "summary.txt"
-    }  # fmt: skip
+        "stream.gss",
+        "metrics.jsonl",
+        "recipe.yaml",
+        "contact_sheet.png",
+        "frames.png",
+        "summary.txt",
+    }
     size = (out / "stream.gss").stat().st_size
     with Playback(out / "stream.gss") as playback:
         packets = sum(playback.entry(frame).size for frame in playback.frames)

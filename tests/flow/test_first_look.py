@@ -14,11 +14,11 @@ from flow_runs import arguments, demo_copy
 
 from gsstream.cli.main import run_command
 from gsstream.core.frame import Frame, join_frames
+from gsstream.discovery.catalog import load_catalog
 from gsstream.encode import open_recording
 from gsstream.engine.run.measure import HeldOut
 from gsstream.input.prepare.pose_checks import check_poses, check_swapped, first_look
 from gsstream.input.recordings.base import FrameSource
-from gsstream.plugins.catalog import load_catalog
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 #: Poses as others write them, and what undoes it.
@@ -54,8 +54,10 @@ def test_swapped_cameras_are_named_and_one_wrong_pose_is_no_swap(frame: Frame, p
         a, b = pair
         images = whole.images.copy()
         images[[a, b]] = images[[b, a]]
-        shown = {split: replace(f, images=images[at]) for split, f, at in
-                 (("train", frame, slice(8)), ("test", source.frame(0, "test"), slice(8, 9)))}  # fmt: skip
+        shown = {
+            split: replace(f, images=images[at])
+            for split, f, at in (("train", frame, slice(8)), ("test", source.frame(0, "test"), slice(8, 9)))
+        }
         mixed = SimpleNamespace(info=source.info, frame=lambda index, split: shown[split])
         (finding,) = first_look(cast("FrameSource", mixed))
     first, second = (whole.cameras.ids[c] for c in sorted(pair))

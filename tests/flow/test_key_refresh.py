@@ -66,8 +66,10 @@ def test_a_key_packet_holds_the_scene_of_its_frame(tmp_path, monkeypatch, method
     lines = metrics(tmp_path)
     assert [line["status"][0] for line in lines] == list("kdkdkd")
     assert [line.get("key_reason") for line in lines] == [None, None, "period", None, "period", None]
-    assert all(sum(line["bytes"].values()) == entry["range"][1] - entry["range"][0] + 1
-               for line, entry in zip(lines, manifest(stream)["packets"], strict=True))  # fmt: skip
+    assert all(
+        sum(line["bytes"].values()) == entry["range"][1] - entry["range"][0] + 1
+        for line, entry in zip(lines, manifest(stream)["packets"], strict=True)
+    )
 
 
 def test_a_key_packet_after_still_frames_says_which_picture_it_shows(tmp_path):

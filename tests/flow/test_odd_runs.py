@@ -19,6 +19,7 @@ from gsstream.player.playback import Playback
 
 TINY_WORLD = "synthetic:frames=3&views=3&width=16&height=12&supersample=1"
 
+
 @pytest.mark.parametrize("method", ["dense", "queen-published"])
 def test_the_reference_renderer_can_grow_a_scene(tmp_path: Path, method: str) -> None:
     """Densification asks a session for the gradient of the 2-D means."""
@@ -72,9 +73,7 @@ def test_leaks_change_the_stream_only_when_asked_for(tmp_path: Path, leak: str) 
     assert encode(tmp_path / leak, data__leak=leak, **options) != honest
 
 
-def test_the_tuning_split_knows_nothing_of_the_test_camera(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_tuning_split_knows_nothing_of_the_test_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Not a byte of a run in the tuning split depends on what the test camera sees."""
     world = "synthetic:frames=2&views=4&width=64&height=48&supersample=1"
     (test_camera,) = open_source(world).info.test.ids

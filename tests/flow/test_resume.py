@@ -13,14 +13,16 @@ import pytest
 from flow_runs import arguments, broken_off_in, encode, growing, metrics, paused
 
 from gsstream.cli.main import run_command
+from gsstream.discovery.catalog import load_catalog
 from gsstream.packet import StreamReader
-from gsstream.plugins.catalog import load_catalog
 
 WORLD = "synthetic:frames=5&views=3&width=32&height=24&supersample=1"
 STILL = f"{WORLD}&static=1"
 SMALL: dict[str, Any] = {
-    "stream__epochs": 2, "first_frame__max_iterations": 8, "first_frame__max_points": 200,
-}  # fmt: skip
+    "stream__epochs": 2,
+    "first_frame__max_iterations": 8,
+    "first_frame__max_points": 200,
+}
 Lines = list[dict[str, Any]]
 
 
@@ -58,8 +60,12 @@ def stands_still(lines: Lines) -> bool:
 PERIOD = {"codec__key_interval": 2}
 #: Of methods that send no residual, so that nothing reads how many passes it gets.
 ONE_PASS: dict[str, Any] = {
-    "stream__epochs": None, "motion__epochs": 1, "growth__epochs": 1, "growth__gradient": 1e-6, "growth__most": 20,
-}  # fmt: skip
+    "stream__epochs": None,
+    "motion__epochs": 1,
+    "growth__epochs": 1,
+    "growth__gradient": 1e-6,
+    "growth__most": 20,
+}
 RUNS: dict[str, Run] = {
     "s2gs-edge": Run(3),
     "key packets, cut at one": Run(2, settings=PERIOD, shows=keys),
@@ -105,7 +111,10 @@ CUTS = ("in a packet", "between packets", "a line lost", "without metrics", "bro
 #: A run that is broken off leaves what "between packets" makes of a whole one: tried for real where more than the
 #: scene is carried from frame to frame.
 BROKEN_OFF = (
-    "s2gs-edge", "disturbed, two cameras, one late", "a budget of bytes", "queen with growth",
+    "s2gs-edge",
+    "disturbed, two cameras, one late",
+    "a budget of bytes",
+    "queen with growth",
     "recon with key packets, whose motion remembers anchors",
 )
 #: Only budgets read what the log says of the frames before; for the others one cut in a packet stands for all of them,
@@ -114,10 +123,11 @@ READ_THE_LOG = ("s2gs-edge", "a budget of bytes", "a residual every second frame
 KNOWN = set(load_catalog().names("method"))
 CELLS = [
     pytest.param(row, cut, id=f"{row}-{cut}")
-    for row, run in RUNS.items() for cut in CUTS
+    for row, run in RUNS.items()
+    for cut in CUTS
     if run.method in KNOWN
     and (row in BROKEN_OFF if cut == "broken off" else row in READ_THE_LOG or cut in ("in a packet", "not at all"))
-]  # fmt: skip
+]
 
 
 class Whole(NamedTuple):

@@ -16,12 +16,12 @@ import pytest
 from forked import Forked
 
 from gsstream.cli.main import run_command
+from gsstream.discovery.catalog import load_catalog
 from gsstream.encode import to_rig_coordinates
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.run.session import STREAM, run
 from gsstream.input.recordings.open import open_source
 from gsstream.packet import StreamReader
-from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from tests.flow import capture
 from tests.flow.flow_runs import TINY, arguments, demo_copy, encode, metrics
@@ -146,9 +146,7 @@ def test_an_absent_camera_is_held_or_its_frame_is_dropped(
     assert all("psnr" in line for line in lines), "the test camera was there all the time"
 
 
-def test_an_absent_camera_ends_the_run_when_the_policy_is_to_wait(
-    finished: Path, tmp_path: Path
-) -> None:
+def test_an_absent_camera_ends_the_run_when_the_policy_is_to_wait(finished: Path, tmp_path: Path) -> None:
     message = r"ends after 2 frames: END was written; frame 2 is left out \(no whole image of cam01\)"
     with (
         capturing(finished, tmp_path / "live", absent=["cam01", 2]) as live,

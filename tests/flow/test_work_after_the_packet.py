@@ -22,14 +22,15 @@ from tests.flow.flow_runs import arguments, demo_copy, encode, metrics
 
 #: Six iterations in each of the frames 1 to 3; Gaussians are added and pruned in the first two of them.
 REFINED: dict[str, Any] = {
-    "stream__refine_frames": 3, "stream__refine_iterations": 6,
+    "stream__refine_frames": 3,
+    "stream__refine_iterations": 6,
 }
 QUICK = {"first_frame__max_iterations": 8, "first_frame__prune_error": 0, "stream__epochs": 1, "scale": 0.5}
 
 #: Gaussians are added early in another process, as in the tests that run in this one.
 EARLY = """
-from gsstream.engine.fit import schedule
-schedule.DENSIFY_FROM, schedule.DENSIFY_EVERY = 5, 4
+from gsstream.engine.fit import constants
+constants.DENSIFY_FROM, constants.DENSIFY_EVERY = 5, 4
 """
 #: The process is killed, as from outside, at an iteration of a frame's refinement.
 DYING = """
@@ -95,9 +96,7 @@ def test_a_run_killed_in_the_refinement_resumes_to_the_same_bytes(
         assert [line["frame"] for line in metrics(tmp_path)] == list(range(6))
 
 
-def test_no_latency_contains_its_own_refinement_but_the_last(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_latency_contains_its_own_refinement_but_the_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By a clock on which every refinement takes a thousand seconds; the packet is in the file when it begins."""
     clock, held = [0.0], []
     advanced = refine.advance_refinement

@@ -11,31 +11,33 @@ from early_densify import densifying
 from similar_worlds import Moved, encode, world
 
 from gsstream.core.world import IDENTITY, World
+from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.assembly.assemble import assemble
-from gsstream.engine.fit import schedule
+from gsstream.engine.fit import constants
 from gsstream.input.recordings.canonical import CanonicalSource, recording_similarity
 from gsstream.input.recordings.open import open_source
-from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 
 SOURCE = "synthetic:frames=3&views=6&width=40&height=30&supersample=1&motion=3"
 SMALL = {  # hold reads no setting of later frames
-    "first_frame.max_iterations": 80, "first_frame.points": "recording",
+    "first_frame.max_iterations": 80,
+    "first_frame.points": "recording",
 }
 METHODS = ("s2gs-edge", "dense", "hold")
 SEEDS = (0, 1, 2)
 #: Without a shift float64 is exact to 1e-15, and cameras and points come out to the same bits.
 EXACT = {"x 1e-6, turned": world(1e-6, turn=6), "x 1e9, turned": world(1e9, turn=7)}
 SHIFTED = {
-    "UTM": world(offset=(5e5, 5.2e6, 300)), "x 1e-6, turned, moved by 1e7": world(1e-6, (10, -10, 10), 8),
+    "UTM": world(offset=(5e5, 5.2e6, 300)),
+    "x 1e-6, turned, moved by 1e7": world(1e-6, (10, -10, 10), 8),
     "x 1e9, turned, moved by 1e7": world(1e9, (1e16, 0, -1e16), 9),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(autouse=True, scope="module")
 def many_seeds_that_grow() -> Iterator[None]:
     with densifying(50, 20), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(schedule, "PIXELS_PER_SEED", 5)
+        patch.setattr(constants, "PIXELS_PER_SEED", 5)
         yield
 
 

@@ -33,10 +33,14 @@ from gsstream.packet import StreamReader, decode_packet
 
 WORLD = "synthetic:frames=7&views=3&width=32&height=24&supersample=1"
 TINY = {
-    "first_frame.max_iterations": 8, "first_frame.max_points": 200, "first_frame.prune_error": 0,
-    "background": [0, 0, 0], "first_frame.shell": False,
-    "first_frame.points": "recording", "stream.epochs": 2,
-}  # fmt: skip
+    "first_frame.max_iterations": 8,
+    "first_frame.max_points": 200,
+    "first_frame.prune_error": 0,
+    "background": [0, 0, 0],
+    "first_frame.shell": False,
+    "first_frame.points": "recording",
+    "stream.epochs": 2,
+}
 
 
 @dataclass(frozen=True)
@@ -119,7 +123,7 @@ ROWS = {
     "few bytes": Row({"budget.size": "80B"}, (0,), "bytes where 80 are allowed"),
     "no time": Row({"budget.time": "0.000001s"}, (0,), "s are allowed for the frame", epochs=0),
     "colour maps of cameras": Row({"first_frame.exposure": True}, (0, 3, 6)),
-}  # fmt: skip
+}
 
 
 @contextmanager
@@ -131,7 +135,7 @@ def encoder(row: Row) -> Iterator[tuple[Encoder, FrameSource]]:
 def made(row: Row, out: Path, resume: bool = False) -> bytes:
     out.mkdir(exist_ok=True)
     with encoder(row) as (subject, source):
-        run(subject.parts, source, out, resume=resume, quiet=True, measure=False)
+        run(subject.assembly, source, out, resume=resume, quiet=True, measure=False)
     return (out / "stream.gss").read_bytes()
 
 

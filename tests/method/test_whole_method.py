@@ -13,6 +13,7 @@ import torch
 from gsstream.cli.main import run_command
 from gsstream.core.changes import Delta, Displacement, Groups
 from gsstream.core.errors import ComponentError, RecipeError
+from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.method.checked import difference_between
@@ -26,7 +27,6 @@ from gsstream.packet import PacketKind
 from gsstream.parts.render.exposure import Exposure
 from gsstream.parts.render.wrt import WrtRows
 from gsstream.player.playback import Playback
-from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe
 from gsstream.testing.method_driver import SOURCE, MethodUnderTest
@@ -55,7 +55,7 @@ def spoilt(wrong) -> StreamingMethod:
 def stepped(part: StreamingMethod, repeat: bool = False, **changes: Any) -> Any:
     """Frame 1 after frame 0, by a whole method; ``repeat``: the recipe's ``stream.on_error``."""
     subject = repeating(MethodUnderTest("dense", part)) if repeat else MethodUnderTest("dense", part)
-    subject.parts = replace(subject.parts, **changes)
+    subject.assembly = replace(subject.assembly, **changes)
     start = subject.begin(open_source(SOURCE).frame(0))
     return subject.step(start.state, open_source(SOURCE).frame(1))
 
@@ -166,9 +166,9 @@ def test_groups_are_compared_field_by_field(begun, field: str, value: Any) -> No
 
 
 def repeating(subject: MethodUnderTest) -> MethodUnderTest:
-    recipe = subject.parts.recipe
+    recipe = subject.assembly.recipe
     stream = recipe.stream.model_copy(update={"on_error": "repeat"})
-    subject.parts = replace(subject.parts, recipe=recipe.model_copy(update={"stream": stream}))
+    subject.assembly = replace(subject.assembly, recipe=recipe.model_copy(update={"stream": stream}))
     return subject
 
 
@@ -238,7 +238,7 @@ def test_the_packet_is_out_before_the_work_that_follows_it() -> None:
     subject = MethodUnderTest("dense", pondering(ponder))
     source = open_source(SOURCE)
     listeners = Callbacks(packet=lambda packet: told.append(("packet", packet.frame)))
-    encoder = Encoder(subject.parts, source.info, lambda _: source.points("recording"), callbacks=listeners)
+    encoder = Encoder(subject.assembly, source.info, lambda _: source.points("recording"), callbacks=listeners)
     steps = [encoder.encode(source.frame(index)) for index in range(3)]
     assert told == [("packet", 0), ("packet", 1), ("follow up", 1), ("packet", 2), ("follow up", 2)]
     assert [getattr(step.state, "about", None) for step in steps] == [None, 1, 2]
@@ -289,7 +289,7 @@ def test_what_fails_after_a_packet_leaves_the_encoder_as_it_was_and_gives_the_pa
 
     subject, source = MethodUnderTest("dense", pondering(ponder)), open_source(SOURCE)
     listeners = Callbacks(packet=sent.append)
-    encoder = Encoder(subject.parts, source.info, lambda _: source.points("recording"), callbacks=listeners)
+    encoder = Encoder(subject.assembly, source.info, lambda _: source.points("recording"), callbacks=listeners)
     before = encoder.encode(source.frame(0)).state
     with pytest.raises(
         ComponentError, match=r"streaming_method 'Wrong' .* failed at frame 1: RuntimeError: out of ideas"
@@ -417,9 +417,9 @@ class TestTools:
         offset = 0.1 * torch.randn(3, 3, generator=generator)
         extra = {**player.meta.extra, "exposure": {"matrix": matrix.tolist(), "offset": offset.tolist()}}
         work = subject.encoder()._tools().open(replace(player, meta=replace(player.meta, extra=extra)), before, now)
-        found, loss = work.loss_and_grad(1, WrtRows(work.gaussians)), subject.parts.loss
+        found, loss = work.loss_and_grad(1, WrtRows(work.gaussians)), subject.assembly.loss
         leaves = work.gaussians.map(lambda value: value.clone().requires_grad_())
-        drawn = subject.parts.renderer.render(leaves, now.cameras, 1, subject.parts.background).image
+        drawn = subject.assembly.renderer.render(leaves, now.cameras, 1, subject.assembly.background).image
         shown = Exposure(matrix, offset)[1].apply(drawn)
         want, gradient = loss.evaluate(shown.detach(), loss.prepare(torch.from_numpy(now.images[1])), 0.2)
         shown.backward(gradient)
@@ -444,7 +444,7 @@ class TestTools:
 
     def test_a_frame_that_is_worth_less_has_fewer_epochs(self, begun) -> None:
         subject, _, _, now = begun
-        tools = replace(subject.encoder()._tools(), parts=replace(subject.parts, recipe=Recipe()))
+        tools = replace(subject.encoder()._tools(), assembly=replace(subject.assembly, recipe=Recipe()))
         assert [tools.epochs(replace(now, epoch_scale=e)) for e in (1.0, 0.5, 0.01)] == [20, 10, 1]
 
 

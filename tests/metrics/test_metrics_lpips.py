@@ -23,9 +23,13 @@ FLOAT = onnx.TensorProto.FLOAT
 
 
 def save(
-    path, *, range_from=None, inputs=(("x", IMAGE, FLOAT), ("y", IMAGE, FLOAT)), outputs=(("d", (1, 1, 1, 1)),),
+    path,
+    *,
+    range_from=None,
+    inputs=(("x", IMAGE, FLOAT), ("y", IMAGE, FLOAT)),
+    outputs=(("d", (1, 1, 1, 1)),),
     nodes=(("Sub", "xy", "e"), ("Abs", "e", "a"), ("ReduceMean", "a", "d")),
-):  # fmt: skip
+):
     """By default the mean absolute difference, as [1, 1, 1, 1]."""
     helper = onnx.helper
     given = [helper.make_tensor_value_info(name, kind, shape) for name, shape, kind in inputs]
@@ -83,19 +87,31 @@ def test_the_option_wins_over_the_metadata(tmp_path):
 
 
 FAULTS = {
-    "one input": ({"inputs": [("x", IMAGE, FLOAT)], "nodes": [("ReduceMean", "x", "d")]},
-                  "expected a model of two inputs, image and target, got 1 ('x')"),
-    "three inputs": ({"inputs": [(name, IMAGE, FLOAT) for name in "xyz"]},
-                     "expected a model of two inputs, image and target, got 3 ('x', 'y', 'z')"),
-    "one channel": ({"inputs": [(name, (1, 1, "h", "w"), FLOAT) for name in "xy"]},
-                    "expected input 'x' to be float32 [1, 3, H, W], got tensor(float) [1, 1, 'h', 'w']"),
-    "no batch": ({"inputs": [(name, (3, "h", "w"), FLOAT) for name in "xy"], "outputs": [("d", (1, 1, 1))]},
-                 "expected input 'x' to be float32 [1, 3, H, W], got tensor(float) [3, 'h', 'w']"),
-    "two outputs": ({"outputs": [("d", (1, 1, 1, 1)), ("a", IMAGE)]},
-                    "expected a model of one output, the distance, got 2"),
-    "a map": ({"outputs": [("a", (1, 3, 19, 23))]},
-              "expected output 'a' to be one float32 number, got tensor(float) [1, 3, 19, 23]; export the mean"),
-}  # fmt: skip
+    "one input": (
+        {"inputs": [("x", IMAGE, FLOAT)], "nodes": [("ReduceMean", "x", "d")]},
+        "expected a model of two inputs, image and target, got 1 ('x')",
+    ),
+    "three inputs": (
+        {"inputs": [(name, IMAGE, FLOAT) for name in "xyz"]},
+        "expected a model of two inputs, image and target, got 3 ('x', 'y', 'z')",
+    ),
+    "one channel": (
+        {"inputs": [(name, (1, 1, "h", "w"), FLOAT) for name in "xy"]},
+        "expected input 'x' to be float32 [1, 3, H, W], got tensor(float) [1, 1, 'h', 'w']",
+    ),
+    "no batch": (
+        {"inputs": [(name, (3, "h", "w"), FLOAT) for name in "xy"], "outputs": [("d", (1, 1, 1))]},
+        "expected input 'x' to be float32 [1, 3, H, W], got tensor(float) [3, 'h', 'w']",
+    ),
+    "two outputs": (
+        {"outputs": [("d", (1, 1, 1, 1)), ("a", IMAGE)]},
+        "expected a model of one output, the distance, got 2",
+    ),
+    "a map": (
+        {"outputs": [("a", (1, 3, 19, 23))]},
+        "expected output 'a' to be one float32 number, got tensor(float) [1, 3, 19, 23]; export the mean",
+    ),
+}
 
 
 @pytest.mark.parametrize("name", FAULTS)

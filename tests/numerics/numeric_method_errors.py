@@ -68,8 +68,10 @@ def propagation(seed: int) -> float:
     node_of = torch.randint(0, 7, (50,), generator=g)
     logits = torch.randn(50, generator=g) * 10.0 ** (seed % 9 - 4)
     got = HierarchicalMax().propagate(logits, Hierarchy(node_of, torch.arange(7), torch.zeros(7, dtype=torch.int64)))
-    want = [max((x for x, n in zip(logits.tolist(), node_of.tolist(), strict=True) if n == node), default=-50.0)
-            for node in range(7)]  # fmt: skip
+    want = [
+        max((x for x, n in zip(logits.tolist(), node_of.tolist(), strict=True) if n == node), default=-50.0)
+        for node in range(7)
+    ]
     return worst(got, torch.tensor(want))
 
 
@@ -94,8 +96,9 @@ def gate_gradient(seed: int) -> float:
 
 def noise(seed: int) -> float:
     u = torch.cat([torch.rand(500, generator=torch.Generator().manual_seed(seed)), torch.tensor([0.0, 1 - 2.0**-24])])
-    want = [math.log(Fraction(x) + Fraction(1, 2**25)) - math.log(1 - Fraction(x) - Fraction(1, 2**25))
-            for x in u.tolist()]  # fmt: skip
+    want = [
+        math.log(Fraction(x) + Fraction(1, 2**25)) - math.log(1 - Fraction(x) - Fraction(1, 2**25)) for x in u.tolist()
+    ]
     exact = torch.tensor(want, dtype=torch.float64)
     return _relative(logistic(u), exact, exact.abs().clamp_min(1.0))
 
@@ -133,14 +136,17 @@ def regulariser(seed: int) -> float:
     return max(abs(float(terms[name]) - value) / value for name, value in want.items())
 
 
-def _change(seed: int, kind: torch.dtype) -> tuple[Gaussians[torch.Tensor], torch.Tensor, dict[str, torch.Tensor],
-                                                   dict[str, torch.Tensor], torch.Tensor]:  # fmt: skip
+def _change(
+    seed: int, kind: torch.dtype
+) -> tuple[Gaussians[torch.Tensor], torch.Tensor, dict[str, torch.Tensor], dict[str, torch.Tensor], torch.Tensor]:
     """Gaussians, gates, latents on their grid, decoders and cells."""
     g = torch.Generator().manual_seed(seed)
     rule, scene = LatentResidual(), random_scene(seed)
     decoders = rule.init_decoders(scene, g)
-    latents = {name: torch.round(4 * torch.randn(value.shape, generator=g)) * rule.codes()[name].step
-               for name, value in init_latents(rule, scene).items()}  # fmt: skip
+    latents = {
+        name: torch.round(4 * torch.randn(value.shape, generator=g)) * rule.codes()[name].step
+        for name, value in init_latents(rule, scene).items()
+    }
     gates, units = torch.randint(1, 11, (len(scene),), generator=g) / 10, torch.rand(len(scene), generator=g) + 0.1
     as_kind = [{name: value.to(kind) for name, value in table.items()} for table in (latents, decoders)]
     return scene.map(lambda v: v.to(kind)), gates.to(kind), as_kind[0], as_kind[1], units.to(kind)

@@ -1,6 +1,5 @@
 """Every stage stays within its bound against float64 (docs/reference/numerics.md has the measured table)."""
 
-
 from __future__ import annotations
 
 import re
@@ -28,6 +27,7 @@ def test_within_the_bound(stage: str) -> None:
     errors = {seed: MEASURES[stage](seed) for seed in draws(10)}
     seed = max(errors, key=lambda s: errors[s])
     assert errors[seed] <= BOUNDS[stage].limit, f"seed {seed}: relative error {errors[seed]:.3g}"
+
 
 ROOT = PAGE.parents[2]
 TEXT = PAGE.read_text(encoding="utf-8")

@@ -112,8 +112,9 @@ def test_gaussians_that_fled_share_outermost_cells_and_overflow_nothing(shift: f
 
 @given(
     st.lists(st.tuples(*[st.floats(-1, 1, width=32)] * 3), min_size=1, max_size=12),
-    st.integers(-18, 20), st.floats(-1e7, 1e7, width=32),
-)  # fmt: skip
+    st.integers(-18, 20),
+    st.floats(-1e7, 1e7, width=32),
+)
 @some(40)
 def test_every_point_has_its_anchor(points: list[tuple[float, float, float]], power: int, offset: float) -> None:
     given_points = cloud(np.float32(2.0**power) * np.array(points, np.float32) + np.float32(offset))

@@ -153,9 +153,11 @@ def test_cameras_whose_matrices_no_renderer_reads_whole_are_refused() -> None:
     rig = camera()
     rig.validate()
     for field, place, value, words in (
-        ("Ks", (0, 0, 1), 0.5, "no skew"), ("Ks", (0, 2, 2), 2.0, "last row 0 0 1"),
-        ("viewmats", (0, 3, 0), 0.1, "last row 0 0 0 1"), ("Ks", (0, 0, 2), np.nan, "expected finite"),
-    ):  # fmt: skip
+        ("Ks", (0, 0, 1), 0.5, "no skew"),
+        ("Ks", (0, 2, 2), 2.0, "last row 0 0 1"),
+        ("viewmats", (0, 3, 0), 0.1, "last row 0 0 0 1"),
+        ("Ks", (0, 0, 2), np.nan, "expected finite"),
+    ):
         spoilt = Cameras(rig.ids, rig.viewmats.copy(), rig.Ks.copy(), rig.width, rig.height)
         getattr(spoilt, field)[place] = value
         with pytest.raises(ShapeError, match=words):

@@ -93,9 +93,12 @@ def test_a_key_packet_refuses_what_it_cannot_hold(name: str, bad: float) -> None
 
 def test_a_residual_that_would_leave_float32_is_refused_by_the_reader() -> None:
     residual = Residual(
-        np.full(6, 10, np.uint8), 10, {"scales": np.full((12, 1), 2**31 - 1, np.int32)}, {"scales": 9e5},
+        np.full(6, 10, np.uint8),
+        10,
+        {"scales": np.full((12, 1), 2**31 - 1, np.int32)},
+        {"scales": 9e5},
         {"scales": np.full((1, 3), 65504, np.float32)},
-    )  # fmt: skip
+    )
     scene = Scene(random_scene(0, n=12).map(lambda value: value.numpy()), layout())
     with pytest.raises(PacketError, match=r"a residual of .* cannot be"):
         decode_delta(encode_delta(Delta((residual,)), layout(), {}, frame=1).data, scene, {})

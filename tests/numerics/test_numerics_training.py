@@ -46,7 +46,7 @@ def quality(subject: MethodUnderTest, state: Any, frame: Frame) -> float:
     values = []
     for view in range(len(frame.cameras)):
         with torch.no_grad():
-            image = subject.parts.renderer.render(state.gaussians, frame.cameras, view, subject.parts.background)
+            image = subject.assembly.renderer.render(state.gaussians, frame.cameras, view, subject.assembly.background)
         values.append(psnr(np.clip(image.image.numpy(), 0, 1), frame.images[view]))
     return float(np.mean(values))
 
@@ -198,9 +198,9 @@ def test_a_spike_of_the_learning_rate_is_refused_or_survived_never_sent_as_garba
         return
     with pytest.raises((ShapeError, ComponentError), match="expected"):
         subject.step(state, now)
-    stream = subject.parts.recipe.stream.model_copy(update={"on_error": "repeat"})
+    stream = subject.assembly.recipe.stream.model_copy(update={"on_error": "repeat"})
     forgiving = copy.copy(subject)
-    forgiving.parts = replace(subject.parts, recipe=subject.parts.recipe.model_copy(update={"stream": stream}))
+    forgiving.assembly = replace(subject.assembly, recipe=subject.assembly.recipe.model_copy(update={"stream": stream}))
     with pytest.warns(UserWarning, match="repeats the one before"):
         step = forgiving.step(state, now)
     assert step.status == "empty"

@@ -32,9 +32,12 @@ def measured(seeds: Iterable[int]) -> dict[str, float]:
 def table(errors: Mapping[str, float], seeds: int, machine: str) -> str:
     """The table as it stands in the page."""
     lines = [
-        BEGIN, f"Worst of {seeds} seeds on {machine}.", "",
-        "| stage | worst error | bound | relative to |", "|---|---|---|---|",
-    ]  # fmt: skip
+        BEGIN,
+        f"Worst of {seeds} seeds on {machine}.",
+        "",
+        "| stage | worst error | bound | relative to |",
+        "|---|---|---|---|",
+    ]
     for name, error in errors.items():
         bound = BOUNDS[name]
         lines.append(f"| {name} | {error:.2g} | {bound.limit:.2g} | {bound.relative_to} |")

@@ -106,9 +106,15 @@ def _out_of_time(_signal: int, _frame: FrameType | None) -> None:
 
 
 def fuzz(
-    count: int, seed: int, *, first: int = 0, memory_mb: int = 256, seconds: float = 5.0, chunk: int = 5000,
+    count: int,
+    seed: int,
+    *,
+    first: int = 0,
+    memory_mb: int = 256,
+    seconds: float = 5.0,
+    chunk: int = 5000,
     quiet: bool = True,
-) -> dict[str, object]:  # fmt: skip
+) -> dict[str, object]:
     """Run ``count`` cases from ``first`` on; returns the summary. Children are spawned: they inherit no state."""
     outcomes: Counter[str] = Counter()
     failures: list[dict[str, object]] = []
@@ -139,9 +145,14 @@ def fuzz(
             took = time.perf_counter() - started
             print(f"{number - first} cases, {len(failures)} failures, {took:.0f} s", flush=True)
     return {
-        "count": count, "seed": seed, "first": first, "seconds": round(time.perf_counter() - started, 1),
-        "memory_mb": memory_mb, "outcomes": dict(sorted(outcomes.items())), "failures": failures,
-    }  # fmt: skip
+        "count": count,
+        "seed": seed,
+        "first": first,
+        "seconds": round(time.perf_counter() - started, 1),
+        "memory_mb": memory_mb,
+        "outcomes": dict(sorted(outcomes.items())),
+        "failures": failures,
+    }
 
 
 def _count(outcomes: Counter[str], failures: list[dict[str, object]], number: int, kind: str, outcome: str) -> None:

@@ -219,7 +219,11 @@ def _seal(kind: int, count: int, frame: int, length: int, body: bytes) -> bytes:
 
 
 _MUTATIONS: dict[str, Callable[[np.random.Generator, Base], bytes]] = {
-    "cut": _cut, "damage": _damage, "sections": _sections, "lying sections": _lying_sections,
-    "lying header": _lying_header, "order": _order,
-}  # fmt: skip
+    "cut": _cut,
+    "damage": _damage,
+    "sections": _sections,
+    "lying sections": _lying_sections,
+    "lying header": _lying_header,
+    "order": _order,
+}
 _WEIGHTS = (0.05, 0.1, 0.65, 0.1, 0.05, 0.05)

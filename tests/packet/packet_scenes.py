@@ -110,7 +110,11 @@ def make_edit(rng: np.random.Generator, state: PlayerState, births: int = 3, dea
 
 
 def make_motion(
-    rng: np.random.Generator, scene: Scene, cell: float = 1.5, brightness_bins: int = 2, share: float = 0.6,
+    rng: np.random.Generator,
+    scene: Scene,
+    cell: float = 1.5,
+    brightness_bins: int = 2,
+    share: float = 0.6,
     **said: bool,
 ) -> Motion:
     """A motion of a share of the scene's groups; most corrections are 0."""

@@ -62,10 +62,11 @@ def test_blobs_round_trip(blobs):
 @settings(max_examples=150)
 @given(
     hnp.arrays(
-        np.int32, st.tuples(st.integers(0, 60), st.integers(0, 5)),
+        np.int32,
+        st.tuples(st.integers(0, 60), st.integers(0, 5)),
         elements=st.one_of(st.integers(-3, 3), st.integers(-500, 500), INT32),
     )
-)  # fmt: skip
+)
 def test_symbols_round_trip(table):
     data = encode_symbols(table)
     decoded = decode_symbols(data, *table.shape)

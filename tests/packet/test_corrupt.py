@@ -114,12 +114,19 @@ def _header(kind, sections, frame, body, data=b""):
 @pytest.mark.parametrize(
     "packet",
     [
-        _header(9, 0, 1, 0), _header(2, 255, 1, 4000), _header(2, 0, 1, MAX_BODY + 1), _header(2, 3, 1, 2, b"ab"),
-        _header(2, 1, 1, 5, struct.pack("<BI", 99, 0)), _header(2, 1, 1, 5, struct.pack("<BI", 3, 0xFFFFFFFF)),
-        _header(2, 2, 1, 10, struct.pack("<BIBI", 3, 0, 3, 0)), _header(2, 1, 1, 6, struct.pack("<BI", 3, 0) + b"x"),
-        _header(3, 1, 1, 5, struct.pack("<BI", 3, 0)), _header(3, 0, 5, 0), _header(2, 0, 1, 0),
+        _header(9, 0, 1, 0),
+        _header(2, 255, 1, 4000),
+        _header(2, 0, 1, MAX_BODY + 1),
+        _header(2, 3, 1, 2, b"ab"),
+        _header(2, 1, 1, 5, struct.pack("<BI", 99, 0)),
+        _header(2, 1, 1, 5, struct.pack("<BI", 3, 0xFFFFFFFF)),
+        _header(2, 2, 1, 10, struct.pack("<BIBI", 3, 0, 3, 0)),
+        _header(2, 1, 1, 6, struct.pack("<BI", 3, 0) + b"x"),
+        _header(3, 1, 1, 5, struct.pack("<BI", 3, 0)),
+        _header(3, 0, 5, 0),
+        _header(2, 0, 1, 0),
     ],
-)  # fmt: skip
+)
 def test_impossible_headers_stop_the_walk_at_their_byte(tmp_path, small, packet):
     packets, states = small
     path = tmp_path / "s.gss"

@@ -1,6 +1,5 @@
 """The ends of what motions, fields and scenes can say: what is reached, what is refused, and what is not written."""
 
-
 from __future__ import annotations
 
 import dataclasses
@@ -179,13 +178,14 @@ def test_an_encoder_refuses_fields_that_are_none():
     state, field = field_state()
     change = dataclasses.replace
     wrong = [
-        (change(field, entry_step=0), "step of entry"), (change(field, weight_step=2**17 + 1), "step of weight"),
+        (change(field, entry_step=0), "step of entry"),
+        (change(field, weight_step=2**17 + 1), "step of weight"),
         (change(field, shape=change(field.shape, reach=0.1)), "reach: expected a float32"),
         (change(field, shape=change(field.shape, low=(0.1, 0.0, 0.0))), "box: expected float32"),
         (change(field, entries=field.entries[1:]), "expected tables of 3 levels and 3 layers, got 5"),
         (change(field, weights=tuple(w.astype(np.int64) for w in field.weights)), "expected tables of int32"),
         (change(field, marks=2 * field.marks), "gates: expected"),
-    ]  # fmt: skip
+    ]
     for bad, message in wrong:
         with pytest.raises(ShapeError, match=message):
             encode_delta(Delta((bad,)), state.layout, {}, frame=1)

@@ -1,6 +1,5 @@
 """Motions in packets: round trips, a second decoder written from the text, pinned bits."""
 
-
 from __future__ import annotations
 
 import dataclasses
@@ -64,9 +63,14 @@ def random_frame(rng: np.random.Generator, state: PlayerState, reach: float) -> 
     for _ in range(int(rng.integers(0, 4))):
         cell = float(np.float32(reach * rng.choice([0.01, 0.7, 2.0, 1e4])))
         motion = make_motion(
-            rng, scene, cell, int(rng.choice([1, 2, 16])), float(rng.choice([0.0, 0.5, 1.0])),
-            predicted=bool(rng.random() < 0.7), regroup=bool(rng.random() < 0.3),
-        )  # fmt: skip
+            rng,
+            scene,
+            cell,
+            int(rng.choice([1, 2, 16])),
+            float(rng.choice([0.0, 0.5, 1.0])),
+            predicted=bool(rng.random() < 0.7),
+            regroup=bool(rng.random() < 0.3),
+        )
         if motions and rng.random() < 0.5:  # the groups of the one before, once more
             last = motions[-1]
             moving = last.moving * (rng.random(len(last.moving)) < 0.5).astype(np.uint8)
@@ -95,9 +99,10 @@ def oracle_step(world: World, state: PlayerState, after: PlayerState) -> None:
         touched |= world.move(motion)
     if after.delta.residual is not None:
         gaussians = dataclasses.replace(
-            state.gaussians, means=np.array(world.means, np.float32).reshape(-1, 3),
+            state.gaussians,
+            means=np.array(world.means, np.float32).reshape(-1, 3),
             quats=np.array(world.quats, np.float32).reshape(-1, 4),
-        )  # fmt: skip
+        )
         changed = apply_residual(gaussians, state.layout, after.delta.residual)
         world.means, world.quats = changed.means.tolist(), changed.quats.tolist()
         world.sh0 = changed.sh0[:, 0].tolist()
@@ -123,10 +128,14 @@ def check_equal(world: World, state: PlayerState) -> None:
     else:
         assert (groups.cell, groups.brightness_bins) == world.named
         assert (groups.group_of.tolist(), groups.count) == (world.group_of, world.count)
-    found = {} if moved is None else {
-        row: (translation.tolist(), rotation.tolist())
-        for row, translation, rotation in zip(moved.rows.tolist(), moved.translation, moved.rotation, strict=True)
-    }  # fmt: skip
+    found = (
+        {}
+        if moved is None
+        else {
+            row: (translation.tolist(), rotation.tolist())
+            for row, translation, rotation in zip(moved.rows.tolist(), moved.translation, moved.rotation, strict=True)
+        }
+    )
     assert found == world.moved
 
 
@@ -233,10 +242,13 @@ def pinned_stream() -> dict[str, PlayerState]:
     number = 24
     grid = np.arange(number * 3, dtype=np.float32).reshape(number, 3)
     scene = dataclasses.replace(
-        make_scene(np.random.default_rng(0), number, 0), means=grid % 7 - grid % 5 / 2,
+        make_scene(np.random.default_rng(0), number, 0),
+        means=grid % 7 - grid % 5 / 2,
         quats=np.stack([np.ones(number), grid[:, 0] % 3, -grid[:, 1] % 4, grid[:, 2] % 2], 1).astype(np.float32),
-        scales=-2 - grid % 2, opacities=grid[:, 0] % 3, sh0=(grid % 4 / 4 - 0.4).astype(np.float32)[:, None],
-    )  # fmt: skip
+        scales=-2 - grid % 2,
+        opacities=grid[:, 0] % 3,
+        sh0=(grid % 4 / 4 - 0.4).astype(np.float32)[:, None],
+    )
     layout = Layout(np.full(6, 4, np.int32), np.zeros(number, np.uint8), np.float32([1]))
     state = decode_packet(None, encode_key(KeyState(scene, layout, make_key(np.random.default_rng(0)).meta)).data)
     states = {}

@@ -65,9 +65,13 @@ def naive(state, delta):
 
 @settings(max_examples=80, deadline=None)
 @given(
-    SEEDS, st.integers(0, 40), st.integers(1, 12), st.integers(0, 30), st.sampled_from([0.0, 0.2, 1.0]),
+    SEEDS,
+    st.integers(0, 40),
+    st.integers(1, 12),
+    st.integers(0, 30),
+    st.sampled_from([0.0, 0.2, 1.0]),
     st.sampled_from([0, 3, 8, 15]),
-)  # fmt: skip
+)
 def test_a_decoded_edit_is_what_plain_python_makes_of_it(seed, number, nodes, births, deaths, sh_rest):
     rng = np.random.default_rng(seed)
     state = first_state(rng, number, nodes, sh_rest)

@@ -67,9 +67,14 @@ def test_the_moving_sample_has_every_form_of_motion(version):
             said += [(m.predicted, m.regroup, bool(m.symbols.any())) for m in motions if len(m.symbols)]
             said += [(len(motions), type(change).__name__) for change in (state.delta.changes if state.delta else ())]
     wanted = {
-        (False, False, True), (True, False, False), (True, False, True), (True, True, True),
-        (1, "Residual"), (1, "RowEdit"), (2, "Motion"),
-    }  # fmt: skip
+        (False, False, True),
+        (True, False, False),
+        (True, False, True),
+        (True, True, True),
+        (1, "Residual"),
+        (1, "RowEdit"),
+        (2, "Motion"),
+    }
     assert wanted <= set(said)
 
 

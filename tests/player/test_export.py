@@ -59,8 +59,15 @@ def test_ply_holds_the_scene_by_the_names_of_3dgs(sh_rest, number):
     found = read_ply(ply_bytes(scene))
     assert list(found)[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     assert list(found)[9 + 3 * sh_rest :] == [
-        "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"
-    ]  # fmt: skip
+        "opacity",
+        "scale_0",
+        "scale_1",
+        "scale_2",
+        "rot_0",
+        "rot_1",
+        "rot_2",
+        "rot_3",
+    ]
     for i in range(number):
         assert [found[n][i] for n in "xyz"] == scene.means[i].tolist()
         assert [found[f"f_dc_{c}"][i] for c in range(3)] == scene.sh0[i, 0].tolist()

@@ -13,7 +13,7 @@ from pydantic import BaseModel
 
 from gsstream.cli.run import run
 from gsstream.core.errors import RecipeError, UnknownName
-from gsstream.plugins.catalog import load_catalog
+from gsstream.discovery.catalog import load_catalog
 from gsstream.recipe.document import read_file
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import ComponentRef, Recipe
@@ -72,9 +72,11 @@ ROOT = Path(__file__).parents[2]
 MOST = 55
 #: Options of ``gsstream run`` and the keys that they set.
 OPTIONS = {
-    "--method": ("method",), "--scale": ("scale",), "--frames": ("frames",),
+    "--method": ("method",),
+    "--scale": ("scale",),
+    "--frames": ("frames",),
     "--budget": ("budget.time", "budget.size", "budget.rate", "budget.memory"),
-}  # fmt: skip
+}
 
 
 def keys(model: type[BaseModel] = Recipe, above: str = "") -> Iterator[str]:

@@ -277,7 +277,7 @@ def test_provenance_stands_beside_every_value(lab) -> None:
     assert levels.endswith("# command line")
 
 
-NAMED = ("[0001, 12, null, cam]", "[\"0001\", '12', \"null\", cam]", "\n  - 0001\n  - 12\n  - null\n  - cam")
+NAMED = ("[0001, 12, null, cam]", '["0001", \'12\', "null", cam]', "\n  - 0001\n  - 12\n  - null\n  - cam")
 
 
 @pytest.mark.parametrize("written", NAMED)
@@ -293,7 +293,9 @@ def test_names_of_cameras_are_what_is_written(lab, written: str) -> None:
 def test_the_keys_that_hold_names_are_those_of_the_recipe() -> None:
     models = {name: field.annotation for name, field in Recipe.model_fields.items()}
     lists = {
-        (section, key) for section, model in models.items() for key, field in getattr(model, "model_fields", {}).items()
+        (section, key)
+        for section, model in models.items()
+        for key, field in getattr(model, "model_fields", {}).items()
         if "tuple[str" in str(field.annotation)
-    }  # fmt: skip
+    }
     assert lists == set(NAMES)

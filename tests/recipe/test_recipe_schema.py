@@ -15,8 +15,8 @@ from ruamel.yaml import YAML
 
 from gsstream.cli.main import run_command
 from gsstream.core.errors import GsstreamError
+from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.assembly.assemble import assemble
-from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.save import to_yaml
 from gsstream.spec import MethodSpec
@@ -98,9 +98,13 @@ def test_faults_are_found_where_they_are(anything, dense) -> None:
 
 
 VALUES = st.one_of(
-    st.integers(-3, 5), st.floats(-2, 2).filter(lambda x: not x.is_integer()), st.booleans(), st.none(),
-    st.sampled_from(["auto", "fresh", "flat", "x", "1"]), st.lists(st.floats(0.1, 0.9), max_size=4),
-)  # fmt: skip
+    st.integers(-3, 5),
+    st.floats(-2, 2).filter(lambda x: not x.is_integer()),
+    st.booleans(),
+    st.none(),
+    st.sampled_from(["auto", "fresh", "flat", "x", "1"]),
+    st.lists(st.floats(0.1, 0.9), max_size=4),
+)
 BASE = {"renderer": "reference", "loss": {"backend": "reference"}}
 
 

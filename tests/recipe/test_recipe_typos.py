@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from gsstream.core.errors import RecipeError
+from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.assembly.assemble import SLOTS, assemble
-from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import ComponentRef, Recipe
 

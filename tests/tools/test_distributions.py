@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from ruamel.yaml import YAML
 
 import gsstream
-from gsstream.core.needs import ON_INDEX
+from gsstream.core.install_hints import ON_INDEX
 from tools.dist import PINS, ROOT, SUMS, build, projects
 
 PROJECTS = projects()

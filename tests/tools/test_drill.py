@@ -28,8 +28,14 @@ def test_the_loop_never_jumps() -> None:
 
 
 def test_dropped_frames_do_not_count_for_latency() -> None:
-    lines = [line(0, 50.0), line(1, 3.0), line(2, 9.0, "dropped"), line(3, 1.0, "hurried"),
-             line(4, 2.0, status="key", bytes={"header": 5000}), line(5, 4.0, "held")]  # fmt: skip
+    lines = [
+        line(0, 50.0),
+        line(1, 3.0),
+        line(2, 9.0, "dropped"),
+        line(3, 1.0, "hurried"),
+        line(4, 2.0, status="key", bytes={"header": 5000}),
+        line(5, 4.0, "held"),
+    ]
     found = reported(lines)
     assert [found[name] for name in ("dropped", "missing", "hurried", "held", "keys_later")] == [1, 0, 1, 1, 1]
     assert (found["latency_first_s"], found["latency_median_s"], found["latency_worst_s"]) == (50.0, 2.5, 4.0)

@@ -33,12 +33,15 @@ TEST = "from gsstream.shapes.boxes import area\n\n\ndef test_area():\n    assert
 def root(tmp_path: Path) -> Path:
     """A repository of one package, tested in part."""
     for name, text in (
-        ("gsstream/shapes/boxes.py", CODE), ("tests/shapes/test_boxes.py", TEST), ("tests/flow/test_all.py", TEST),
-        ("tests/shapes/test_a_small_one.py", "def test_nothing():\n    pass\n"), ("gsstream/__init__.py", ""),
+        ("gsstream/shapes/boxes.py", CODE),
+        ("tests/shapes/test_boxes.py", TEST),
+        ("tests/flow/test_all.py", TEST),
+        ("tests/shapes/test_a_small_one.py", "def test_nothing():\n    pass\n"),
+        ("gsstream/__init__.py", ""),
         ("tests/lines/test_lines.py", "def test_nothing():\n    pass\n"),
         ("tests/points/test_points.py", "from gsstream.shapes import boxes\n"),
         ("pytest.ini", "[pytest]\npythonpath = .\nmarkers = slow\n"),
-    ):  # fmt: skip
+    ):
         (tmp_path / "repository" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "repository" / name).write_text(text)
     return tmp_path / "repository"
@@ -52,9 +55,17 @@ def test_what_is_changed_and_what_is_left_alone(root: Path) -> None:
     """Neither docstrings, annotations, messages, refusals as a whole nor paths."""
     found = changes_of(root, ["gsstream"])
     assert said(found) == {
-        "6 2>3", "7 <><=", "7 0>1", "11 *>/", "15 not >", "15 , reverse=True>", "15 True>False", "15 0>1", "15 >>>=",
+        "6 2>3",
+        "7 <><=",
+        "7 0>1",
+        "11 *>/",
+        "15 not >",
+        "15 , reverse=True>",
+        "15 True>False",
+        "15 0>1",
+        "15 >>>=",
         "15 0.5>1.0",
-    }  # fmt: skip
+    }
     data = (root / "gsstream/shapes/boxes.py").read_bytes()
     assert b"return width / height" in next(c for c in found if c.line == 11).apply(data)
 
@@ -70,9 +81,11 @@ def test_a_seed_draws_one_change_of_each_of_some_lines(root: Path) -> None:
 def test_tests_that_name_the_module_come_first_and_whole_runs_last(root: Path) -> None:
     change = changes_of(root, ["gsstream"])[0]
     assert files_asked(root, change) == [
-        "tests/points/test_points.py", "tests/shapes/test_boxes.py", "tests/shapes/test_a_small_one.py",
+        "tests/points/test_points.py",
+        "tests/shapes/test_boxes.py",
+        "tests/shapes/test_a_small_one.py",
         "tests/flow/test_all.py",
-    ]  # fmt: skip
+    ]
 
 
 def test_every_change_has_a_line_and_a_second_run_makes_none_twice(root: Path, tmp_path: Path) -> None:

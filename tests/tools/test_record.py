@@ -42,9 +42,11 @@ EMPTY: tuple[PacketKind, Sections] = (PacketKind.EMPTY, [])
     ids=["equal", "another recipe", "another value", "a section less", "another kind", "a packet less"],
 )
 def test_the_first_difference_is_named(
-    before: tuple[tuple[PacketKind, Sections], ...], after: tuple[tuple[PacketKind, Sections], ...], said: str,
+    before: tuple[tuple[PacketKind, Sections], ...],
+    after: tuple[tuple[PacketKind, Sections], ...],
+    said: str,
     tmp_path: Path,
-) -> None:  # fmt: skip
+) -> None:
     assert first_difference(run_of(tmp_path / "before", *before), run_of(tmp_path / "after", *after)) == said
 
 

@@ -163,8 +163,10 @@ def test_rows_taken_twice_keep_the_commit_that_ran_them() -> None:
     old = [ran, {**ran, "name": "gone"}, {"by": "hand"}]
     new = [{**RUN, "date": "monday", "commit": "b"}, {**RUN, "seed": 1, "date": "tuesday", "commit": "b"}]
     assert [(row["name"], row["seed"], row["commit"]) for row in merged(old, new)] == [
-        ("edge", 0, "a"), ("gone", 0, "a"), ("edge", 1, "b"),
-    ]  # fmt: skip
+        ("edge", 0, "a"),
+        ("gone", 0, "a"),
+        ("edge", 1, "b"),
+    ]
     again = [{**RUN, "date": "tuesday", "commit": "b", "psnr": 31.0}]
     assert merged(old, again)[0]["commit"] == "b"
 

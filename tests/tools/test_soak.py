@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsstream.plugins.catalog import load_catalog
+from gsstream.discovery.catalog import load_catalog
 from tools.soak import __main__ as soak
 from tools.soak import drive
 from tools.soak.cases import SOMETIMES, Case, draw_case, draw_value

@@ -96,7 +96,6 @@ class Handler(SimpleHTTPRequestHandler):
                 self.connection.shutdown(socket.SHUT_WR)
                 self.close_connection = True
 
-
     def _send_in_two(self, part: bytes, faults: dict[str, Any]) -> None:
         held = faults["held_after"]
         with contextlib.suppress(OSError):

@@ -66,9 +66,7 @@ def served(*arguments: object, **environment: str) -> Iterator[tuple[str, subpro
     """``gsstream open`` as a process; yields the address that it prints and the process."""
     command = [sys.executable, "-c", "from gsstream.cli.main import main; main()", "open", *map(str, arguments)]
     settings = os.environ | {"BROWSER": "true"} | environment
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=settings
-    ) as process:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=settings) as process:
         try:
             assert process.stdout is not None
             line = process.stdout.readline()
@@ -99,9 +97,13 @@ def live_socket(url: str, **settings: Any) -> Any:
 
     address, _, query = url.partition("?")
     return connect(
-        address.replace("http", "ws", 1) + "live" + (f"?{query}" if query else ""), compression=None, max_size=None,
-        proxy=None, open_timeout=60, **settings,
-    )  # fmt: skip
+        address.replace("http", "ws", 1) + "live" + (f"?{query}" if query else ""),
+        compression=None,
+        max_size=None,
+        proxy=None,
+        open_timeout=60,
+        **settings,
+    )
 
 
 def packets_from(

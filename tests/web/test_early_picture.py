@@ -147,10 +147,14 @@ def test_a_byte_less_than_the_first_layer_draws_nothing(tmp_path):
     _, packet = layered()
     package(written(tmp_path, packet), tmp_path / "site")
     steps = [
-        ["go", "URL/index.html"], ["until", f"{PLAYER}?.buffer?.loading"], ["pause", 1500],
+        ["go", "URL/index.html"],
+        ["until", f"{PLAYER}?.buffer?.loading"],
+        ["pause", 1500],
         ["evaluate", f"[{EARLY} ?? null, {PLAYER}.state, {PLAYER}.statistics.drawn]"],
-        ["evaluate", "fetch('mended')"], READY, ["evaluate", f"{PLAYER}.problem"],
-    ]  # fmt: skip
+        ["evaluate", "fetch('mended')"],
+        READY,
+        ["evaluate", f"{PLAYER}.problem"],
+    ]
     with serving(tmp_path / "site", held_after=needed(packet) - 1) as (url, _):
         results = in_browser(at(url, steps), tmp_path, size=(64, 48))
     assert results[3] == [None, None, 0]

@@ -67,16 +67,24 @@ CONTROLS = f"""
 @pytest.mark.parametrize(
     ("page", "size", "wide"),
     [
-        ("outer.html", (280, 600), False), ("outer.html", (320, 600), False), ("index.html", (390, 844), False),
-        ("outer.html", (640, 700), False), ("index.html", (1099, 500), False), ("index.html", (1100, 500), True),
-        ("index.html", (1920, 1080), True), ("index.html", (3840, 400), True),
+        ("outer.html", (280, 600), False),
+        ("outer.html", (320, 600), False),
+        ("index.html", (390, 844), False),
+        ("outer.html", (640, 700), False),
+        ("index.html", (1099, 500), False),
+        ("index.html", (1100, 500), True),
+        ("index.html", (1920, 1080), True),
+        ("index.html", (3840, 400), True),
     ],
-)  # fmt: skip
+)
 def test_the_bar_is_one_line_of_large_targets_at_every_width(site, tmp_path, page, size, wide):
     steps = [
-        ["go", f"URL/{page}"], READY, ["evaluate", CONTROLS], ["evaluate", f"{ROOT}.querySelector('.more').click()"],
+        ["go", f"URL/{page}"],
+        READY,
         ["evaluate", CONTROLS],
-    ]  # fmt: skip
+        ["evaluate", f"{ROOT}.querySelector('.more').click()"],
+        ["evaluate", CONTROLS],
+    ]
     _, _, closed, _, opened = look(site, tmp_path, steps, size=size)
     inside = ["speed", "loop", "marks", "statistics", "full"]
     bar = ["play", "seek", "camera"]
@@ -156,9 +164,14 @@ def test_the_poster_is_shown_until_the_first_picture(site, tmp_path, page, poste
     bar = f"{ROOT}.querySelector('.bar').checkVisibility()"
     state = f"[{image}.checkVisibility() && {image}.src.split('/').pop(), {bar}, {MESSAGE}]"
     steps = [
-        ["go", f"URL/{page}"], ["until", f"{ROOT}?.querySelector('.poster').naturalWidth"], ["pause", 200],
-        ["evaluate", state], ["evaluate", "fetch('mended')"], READY, ["evaluate", state],
-    ]  # fmt: skip
+        ["go", f"URL/{page}"],
+        ["until", f"{ROOT}?.querySelector('.poster').naturalWidth"],
+        ["pause", 200],
+        ["evaluate", state],
+        ["evaluate", "fetch('mended')"],
+        READY,
+        ["evaluate", state],
+    ]
     with serving(site, held_after=100) as (url, _):
         results = in_browser(at(url, steps), tmp_path)
     assert results[3] == [poster, False, "Loading …"]
@@ -167,9 +180,10 @@ def test_the_poster_is_shown_until_the_first_picture(site, tmp_path, page, poste
 
 def test_a_page_opened_as_a_file_says_how_to_serve_it(site, tmp_path):
     steps = [
-        ["go", (site / "index.html").as_uri()], ["until", "document.querySelector('p')"],
+        ["go", (site / "index.html").as_uri()],
+        ["until", "document.querySelector('p')"],
         ["evaluate", "document.body.innerText"],
-    ]  # fmt: skip
+    ]
     (*_, text), _ = try_in_browser(steps, tmp_path)
     assert f'python -m http.server --directory "{site}/"' in text
     assert "gsstream-player" not in text
@@ -181,9 +195,12 @@ def test_a_still_scene_has_no_time(tmp_path):
         writer.append(moving_packets(seed=3, frames=1, number=80, nodes=20)[0])
     package(stream, site)
     steps = [
-        ["go", "URL/index.html"], READY, ["evaluate", f"{ROOT}.querySelector('.more').click()"],
-        ["evaluate", CONTROLS], ["evaluate", f"{ROOT}.querySelector('.time').checkVisibility()"],
-    ]  # fmt: skip
+        ["go", "URL/index.html"],
+        READY,
+        ["evaluate", f"{ROOT}.querySelector('.more').click()"],
+        ["evaluate", CONTROLS],
+        ["evaluate", f"{ROOT}.querySelector('.time').checkVisibility()"],
+    ]
     *_, controls, time = look(site, tmp_path, steps)
     assert [name for name, *_ in controls] == ["camera", "statistics", "full", "more"]
     assert not time

@@ -62,8 +62,11 @@ def test_the_browser_reaches_the_same_bits_from_every_join(joined, tmp_path):
     (tmp_path / "parts.bin").write_bytes(b"".join(struct.pack("<I", len(part)) + part for part in parts))
     done = subprocess.run(
         [str(NODE), str(HERE / "join.mjs"), str(tmp_path / "parts.bin"), str(len(packets))],
-        capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     digests = [digest(state) for state in states]
     assert json.loads(done.stdout) == [digests[frame:] for frame in range(1, len(states))]

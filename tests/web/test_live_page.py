@@ -183,10 +183,14 @@ def test_what_is_wrong_is_said_in_one_sentence(page, packets, tmp_path, case):
     Growing(file).write(packets[:3])
     options = {"token": "secret"} if "token" in case else {"max_viewers": 0} if case == "viewers" else {}
     expected = {
-        "no stream": "ot a gsstream file", "newer": "cannot be read",
-        "token": "needs a token", "wrong token": "needs a token",
-        "viewers": "0 viewers are watching already", "nobody": "No live stream answers", "a recording": "404",
-    }[case]  # fmt: skip
+        "no stream": "ot a gsstream file",
+        "newer": "cannot be read",
+        "token": "needs a token",
+        "wrong token": "needs a token",
+        "viewers": "0 viewers are watching already",
+        "nobody": "No live stream answers",
+        "a recording": "404",
+    }[case]
     if case == "no stream":
         file.write_bytes(b"<!doctype html>........")
     elif case == "newer":
@@ -211,12 +215,13 @@ def test_a_server_that_sends_no_stream_is_told(page, packets):
     newer[10] += 1
     newer[12:16] = zlib.crc32(newer[:12]).to_bytes(4, "little")
     cases = [
-        ([bytes(newer)], "newer than this player"), ([b"<!doctype html>"], "ot a gsstream file"),
+        ([bytes(newer)], "newer than this player"),
+        ([b"<!doctype html>"], "ot a gsstream file"),
         ([HEADER, packets[1].data], "without the one before it; trying again"),
         ([HEADER, packets[0].data, packets[1].data[:-1]], "no stream; trying again"),
         ([HEADER, packets[0].data, b"\x07" * 40], "damaged"),
         (["{", "7", '{"state": 5}', HEADER], "No frame is encoded yet"),
-    ]  # fmt: skip
+    ]
     for messages, words in cases:
 
         def answer(viewer, messages=messages):

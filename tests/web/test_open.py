@@ -57,8 +57,12 @@ def answer(url: str, path: str, **headers: str) -> tuple[int, bytes]:
 def test_the_stream_plays_in_a_browser(opened, tmp_path):
     _, url, _ = opened
     player = "document.querySelector('gsstream-player')?.player"
-    steps = [["go", url], ["until", f"{player}?.statistics.drawn"], ["evaluate", f"{player}.seek(11)"],
-             ["until", f"{player}.frame === 11"]]  # fmt: skip
+    steps = [
+        ["go", url],
+        ["until", f"{player}?.statistics.drawn"],
+        ["evaluate", f"{player}.seek(11)"],
+        ["until", f"{player}.frame === 11"],
+    ]
     in_browser(steps, tmp_path)
 
 

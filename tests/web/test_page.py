@@ -116,11 +116,14 @@ def test_a_picture_that_does_not_change_is_not_drawn_again(site, tmp_path):
 def test_every_frame_is_reached_whatever_the_server_does(site, tmp_path, name, faults):
     """Ranges, none (200 for 206), and connections that break again and again."""
     steps = [
-        ["go", f"URL/index.html?src={name}"], READY, ["evaluate", f"{PLAYER}.seek(11)"],
+        ["go", f"URL/index.html?src={name}"],
+        READY,
+        ["evaluate", f"{PLAYER}.seek(11)"],
         ["until", f"{PLAYER}.frame === 11", 30],
-        ["evaluate", f"{PLAYER}.seek(8)"], ["until", f"{PLAYER}.frame === 8", 30],
+        ["evaluate", f"{PLAYER}.seek(8)"],
+        ["until", f"{PLAYER}.frame === 8", 30],
         ["evaluate", f"[{PLAYER}.first, {PLAYER}.last, {PLAYER}.problem]"],
-    ]  # fmt: skip
+    ]
     with serving(site, **faults) as (url, server):
         results, _ = try_in_browser(at(url, steps), tmp_path, size=SIZE)
     assert results[-1] == [0, 11, None]
@@ -130,8 +133,10 @@ def test_every_frame_is_reached_whatever_the_server_does(site, tmp_path, name, f
 
 def test_a_seek_in_a_file_with_an_index_fetches_the_last_segment_first(site, tmp_path):
     steps = [
-        ["go", "URL/index.html?src=stream.gss"], READY, ["evaluate", f"{PLAYER}.buffer.parts.length"],
-    ]  # fmt: skip
+        ["go", "URL/index.html?src=stream.gss"],
+        READY,
+        ["evaluate", f"{PLAYER}.buffer.parts.length"],
+    ]
     with serving(site) as (url, server):
         results = in_browser(at(url, steps), tmp_path, size=SIZE)
         ranges = [wanted for path, wanted in server.requests if path == "/stream.gss"]
@@ -169,17 +174,23 @@ def test_what_is_wrong_is_said_in_one_sentence(site, tmp_path):
     newer[8] += 1
     newer[12:16] = zlib.crc32(newer[:12]).to_bytes(4, "little")
     for name, data in {
-        "none.gss": b"<!doctype html>", "empty.gss": b"", "newer.gss": bytes(newer),
-    }.items():  # fmt: skip
+        "none.gss": b"<!doctype html>",
+        "empty.gss": b"",
+        "newer.gss": bytes(newer),
+    }.items():
         (site / name).write_bytes(data)
     manifest = json.loads((site / "stream.json").read_text())
     (site / "newer.json").write_text(json.dumps({**manifest, "format": "gsstream 99.0"}))
     (site / "other.json").write_text("[]")
     expected = {
-        "absent.gss": "404", "absent.json": "404", "none.gss": "not a gsstream file",
-        "empty.gss": "not a gsstream file", "newer.gss": "newer than this player", "newer.json": "99.0",
+        "absent.gss": "404",
+        "absent.json": "404",
+        "none.gss": "not a gsstream file",
+        "empty.gss": "not a gsstream file",
+        "newer.gss": "newer than this player",
+        "newer.json": "99.0",
         "other.json": "no manifest",
-    }  # fmt: skip
+    }
     steps = []
     for name in expected:
         said = f"{PLAYER} && {MESSAGE} !== 'Loading …' && {MESSAGE}"
@@ -209,8 +220,9 @@ def test_what_is_sound_is_played(site, tmp_path, name):
     steps = [
         ["go", f"URL/index.html?src={name}&autoplay=1&loop=false&speed=0.25"],
         ["until", f"{PLAYER}?.state && {PLAYER}.frame >= {frames - 1} && !{PLAYER}.playing", 30],
-        ["evaluate", f"{PLAYER}.frame"], ["evaluate", f"{PLAYER}.problem !== null"],
-    ]  # fmt: skip
+        ["evaluate", f"{PLAYER}.frame"],
+        ["evaluate", f"{PLAYER}.problem !== null"],
+    ]
     with serving(site) as (url, _):
         results, _ = try_in_browser(at(url, steps), tmp_path, size=SIZE)
     assert 0 < frames < 7

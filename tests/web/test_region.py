@@ -63,7 +63,9 @@ RIGS: dict[str, tuple[Cameras, bool, float | None]] = {
     "parallel but for a little": (rig_of(LINE, LINE * (1.05, 1, 1) + (0, 1, 0)), False, FAN),
     "parallel as far as a calibration says": (rig_of(LINE, LINE * (0.995, 1, 1) + (0, 1, 0)), False, FAN),
     "arc, and one from high up": (
-        rig_of([*ring(8, np.pi / 2), *ring(1, 0, 1.0, 2.7, start=3.3)], (0, 0, 0)), False, float(np.degrees(3.0))
+        rig_of([*ring(8, np.pi / 2), *ring(1, 0, 1.0, 2.7, start=3.3)], (0, 0, 0)),
+        False,
+        float(np.degrees(3.0)),
     ),
     "one": (rig_of([(3, 1, 2)], (0, 0, 0)), False, float(np.degrees(2 * MIN_SWING))),
     "side by side": (rig_of([(3, 0, 1), (3, 0.1, 1)], (0, 0, 0)), False, float(np.degrees(2 * MIN_SWING))),
@@ -80,10 +82,13 @@ RIGS: dict[str, tuple[Cameras, bool, float | None]] = {
 def limits(region: Region) -> dict[str, object]:
     """A region as the page has it."""
     return {
-        "azimuth": None if region.azimuth is None else list(region.azimuth), "elevation": list(region.elevation),
-        "distance": list(region.distance), "focus": region.focus.tolist(), "up": region.up.tolist(),
+        "azimuth": None if region.azimuth is None else list(region.azimuth),
+        "elevation": list(region.elevation),
+        "distance": list(region.distance),
+        "focus": region.focus.tolist(),
+        "up": region.up.tolist(),
         "outward": region.outward,
-    }  # fmt: skip
+    }
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -166,14 +171,19 @@ def test_the_page_has_the_same_limits_and_keeps_them(tmp_path):
         region = recorded_region(rig)
         spread = rig.extent * rng.normal(size=(40, 3))
         others = rig_of(rig.centers.mean(0) + 2 * spread, region.focus + rig.extent * rng.normal(size=(40, 3)))
-        hands = np.concatenate([
-            rng.normal(size=(60, 2)), np.exp(rng.normal(size=(60, 1))), rig.extent * rng.normal(size=(60, 3))
-        ], 1)  # fmt: skip
-        given.append({
-            "rig": {"viewmats": rig.viewmats.reshape(-1, 16).tolist(), "Ks": rig.Ks.reshape(-1, 9).tolist()},
-            "others": {"viewmats": others.viewmats.reshape(-1, 16).tolist(), "Ks": others.Ks.reshape(-1, 9).tolist()},
-            "hands": hands.tolist(),
-        })  # fmt: skip
+        hands = np.concatenate(
+            [rng.normal(size=(60, 2)), np.exp(rng.normal(size=(60, 1))), rig.extent * rng.normal(size=(60, 3))], 1
+        )
+        given.append(
+            {
+                "rig": {"viewmats": rig.viewmats.reshape(-1, 16).tolist(), "Ks": rig.Ks.reshape(-1, 9).tolist()},
+                "others": {
+                    "viewmats": others.viewmats.reshape(-1, 16).tolist(),
+                    "Ks": others.Ks.reshape(-1, 9).tolist(),
+                },
+                "hands": hands.tolist(),
+            }
+        )
         expected.append((limits(region), region.outside(others), rig.extent))
     for name, found, (wanted, outside, extent) in zip(RIGS, node(PAGE, given, tmp_path), expected, strict=True):
         for part, value in wanted.items():
@@ -188,11 +198,14 @@ def test_the_page_has_the_same_limits_and_keeps_them(tmp_path):
 HERE = Path(__file__).parent
 SAMPLE = HERE.parent / "packet" / "samples" / "2.0" / "world.gss"
 CANDIDATES = [
-    asdict(IDENTITY), {**asdict(IDENTITY), "scale": 0.0}, {**asdict(IDENTITY), "scale": -2.0},
-    {**asdict(IDENTITY), "rotation": [-1.0, 0, 0, 0, 1, 0, 0, 0, 1]}, {**asdict(IDENTITY), "offset": [1.0, 2.0]},
+    asdict(IDENTITY),
+    {**asdict(IDENTITY), "scale": 0.0},
+    {**asdict(IDENTITY), "scale": -2.0},
+    {**asdict(IDENTITY), "rotation": [-1.0, 0, 0, 0, 1, 0, 0, 0, 1]},
+    {**asdict(IDENTITY), "offset": [1.0, 2.0]},
     {**asdict(IDENTITY), "rotation": [1.0, 0, 0, 0, 1, 0, 0, 1e-5, 1]},
     {**asdict(IDENTITY), "rotation": [1.0, 0, 0, 0, 1, 0, 0, 1e-8, 1]},
-]  # fmt: skip
+]
 
 
 @needs_node

@@ -77,11 +77,23 @@ def test_a_recording_is_served_by_ranges(recorded):
 @pytest.mark.parametrize(
     "path",
     [
-        "/../secret.txt", "/%2e%2e/secret.txt", "/..%2fsecret.txt", "/....//secret.txt", "/secret.txt", "//etc/passwd",
-        "/%2fetc%2fpasswd", "/..%5c..%5csecret.txt", "/changes/../../serve/app.py", "/../serve/app.py", "/%00",
-        "/stream.gss/../secret.txt", "/stream.gss%00.js", "/changes/", "/a" * 2000,
+        "/../secret.txt",
+        "/%2e%2e/secret.txt",
+        "/..%2fsecret.txt",
+        "/....//secret.txt",
+        "/secret.txt",
+        "//etc/passwd",
+        "/%2fetc%2fpasswd",
+        "/..%5c..%5csecret.txt",
+        "/changes/../../serve/app.py",
+        "/../serve/app.py",
+        "/%00",
+        "/stream.gss/../secret.txt",
+        "/stream.gss%00.js",
+        "/changes/",
+        "/a" * 2000,
     ],
-)  # fmt: skip
+)
 def test_nothing_but_the_page_and_the_stream_is_served(recorded, path):
     """The path goes to the server as it stands here: an ordinary client would mend it first."""
     _, url = recorded

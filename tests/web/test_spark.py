@@ -70,8 +70,16 @@ def test_pictures_and_uploads(tmp_path):
     eye = ["evaluate", "camera.position.toArray()"]
     blur = "[spark.preBlurAmount, spark.uniforms.preBlurAmount.value, renderer.domElement.height]"
     with serving(tmp_path / "page") as (url, _), Playback(stream) as playback:
-        steps = [["go", f"{url}/index.html"], ["until", ready], eye, ["drag", 60, 60, 60, 0], eye, ["evaluate", blur],
-                 *ask, ["evaluate", small]]  # fmt: skip
+        steps = [
+            ["go", f"{url}/index.html"],
+            ["until", ready],
+            eye,
+            ["drag", 60, 60, 60, 0],
+            eye,
+            ["evaluate", blur],
+            *ask,
+            ["evaluate", small],
+        ]
         results = in_browser(steps, tmp_path, size=(3 * rig.width, 3 * rig.height))
         before, _, after, (amount, used, height) = results[2:6]
         assert math.dist(before, after) > 0.01, "a drag turns"

@@ -68,8 +68,8 @@ def hooks() -> str:
     from gsstream.cli.plugins import setting_rows
     from gsstream.core.kinds import CONTRACTS, PART_KINDS
     from gsstream.core.part import Traits
+    from gsstream.discovery import hookspecs
     from gsstream.input.recordings.base import FrameSource
-    from gsstream.plugins import hookspecs
     from gsstream.spec import KINDS, ComponentSpec, MethodSpec
 
     lines = [NOTE, "# Hooks, specs and contracts of parts", "", "## Hooks", ""]
@@ -111,7 +111,7 @@ def _named(target: str) -> Any:
 def parts() -> str:
     """Every setting of every part of this repository."""
     from gsstream.cli.plugins import setting_rows
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.spec import KINDS
 
     folders = (ROOT / "plugins").glob("*/pyproject.toml")

@@ -78,7 +78,7 @@ def supervise(seed: int, first: int, until: float, limit: float, out: Path) -> N
 
 def work(seed: int, index: int, until: float | None, limit: float, out: Path) -> dict[str, Any]:
     """Run cases one after another until the time is up (None: this one alone); the last record."""
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.discovery.catalog import load_catalog
     from tools.soak.cases import draw_case
     from tools.soak.drive import run_case
 

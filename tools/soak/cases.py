@@ -20,8 +20,8 @@ from pydantic.fields import FieldInfo
 from gsstream.core.errors import PluginUnavailable
 from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.core.rng import Rng
+from gsstream.discovery.catalog import Catalog
 from gsstream.engine.assembly.recipe_keys import PART_SECTIONS, SESSION_KEYS
-from gsstream.plugins.catalog import Catalog
 
 Generator = np.random.Generator
 Draw = Callable[[Generator], Any]
@@ -71,11 +71,16 @@ def _ints(low: int, high: int) -> Draw:
 
 
 #: Always drawn: what keeps a run short.
-SHORT: Mapping[str, Draw] = MappingProxyType({
-    "seed": _ints(0, 10**6), "frames": _ints(2, 8), "first_frame.max_iterations": _of(0, 1, 10, 30, 60),
-    "first_frame.max_points": _of(1, 5, 100, 400, 400, 1500, 1500),
-    "first_frame.max_gaussians": _of(1, 50, 600, 3000, 3000, 3000), "stream.epochs": _ints(1, 4),
-})  # fmt: skip
+SHORT: Mapping[str, Draw] = MappingProxyType(
+    {
+        "seed": _ints(0, 10**6),
+        "frames": _ints(2, 8),
+        "first_frame.max_iterations": _of(0, 1, 10, 30, 60),
+        "first_frame.max_points": _of(1, 5, 100, 400, 400, 1500, 1500),
+        "first_frame.max_gaussians": _of(1, 50, 600, 3000, 3000, 3000),
+        "stream.epochs": _ints(1, 4),
+    }
+)
 #: Each drawn in some of the cases.
 SOMETIMES: Mapping[str, Draw] = MappingProxyType({
     "scale": _of(1.0, 0.75, 0.5), "near": _logs(1e-3, 0.3),
@@ -92,9 +97,13 @@ SOMETIMES: Mapping[str, Draw] = MappingProxyType({
     "data.leak": _of("none", "points", "training"),
 })  # fmt: skip
 #: Drawn with the others where the method is made of parts.
-OF_PARTS: Mapping[str, Draw] = MappingProxyType({
-    "codec.trim": _of(0.0, 0.3, 0.9, 0.999), "budget.size": _of(16, 200, 1500, 20_000), "budget.time": _logs(1e-3, 2),
-})  # fmt: skip
+OF_PARTS: Mapping[str, Draw] = MappingProxyType(
+    {
+        "codec.trim": _of(0.0, 0.3, 0.9, 0.999),
+        "budget.size": _of(16, 200, 1500, 20_000),
+        "budget.time": _logs(1e-3, 2),
+    }
+)
 
 
 def draw_case(seed: int, index: int, catalog: Catalog) -> Case:

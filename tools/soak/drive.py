@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gsstream.core.errors import ComponentError, InputError, PluginUnavailable, ShapeError
+from gsstream.discovery.catalog import Catalog
 from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.method.wrapped import RepeatedFrameWarning, SkippedWorkWarning
 from gsstream.engine.run.recording import open_recording
@@ -24,7 +25,6 @@ from gsstream.method.base import Step
 from gsstream.packet import PlayerState
 from gsstream.player.playback import Playback
 from gsstream.player.render import find_renderer, render
-from gsstream.plugins.catalog import Catalog
 from gsstream.recipe.load import resolve_recipe
 from tools.soak.cases import Case
 

@@ -66,9 +66,13 @@ class FieldShape:
     def problem(self) -> str | None:
         """Say why a field cannot have this shape; None when it can."""
         ranges = {
-            "levels": MAX_LEVELS, "entries": 20, "features": MAX_FEATURES, "base": MAX_BASE, "width": MAX_INPUTS,
+            "levels": MAX_LEVELS,
+            "entries": 20,
+            "features": MAX_FEATURES,
+            "base": MAX_BASE,
+            "width": MAX_INPUTS,
             "layers": MAX_LAYERS,
-        }  # fmt: skip
+        }
         for name, most in ranges.items():
             if not 1 <= getattr(self, name) <= most:
                 return f"{name}: expected 1 to {most}, got {getattr(self, name)}"

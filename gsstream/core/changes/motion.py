@@ -251,12 +251,14 @@ def quat_multiply(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the quaternion products a b [A, 4] wxyz: first the rotation b, then a."""
     w0, x0, y0, z0 = a.T
     w1, x1, y1, z1 = b.T
-    return np.array([
-        w0 * w1 - x0 * x1 - y0 * y1 - z0 * z1,
-        w0 * x1 + x0 * w1 + y0 * z1 - z0 * y1,
-        w0 * y1 - x0 * z1 + y0 * w1 + z0 * x1,
-        w0 * z1 + x0 * y1 - y0 * x1 + z0 * w1,
-    ]).T  # fmt: skip
+    return np.array(
+        [
+            w0 * w1 - x0 * x1 - y0 * y1 - z0 * z1,
+            w0 * x1 + x0 * w1 + y0 * z1 - z0 * y1,
+            w0 * y1 - x0 * z1 + y0 * w1 + z0 * x1,
+            w0 * z1 + x0 * y1 - y0 * x1 + z0 * w1,
+        ]
+    ).T
 
 
 def _means(values: FloatArray, group: IntArray, number: int) -> FloatArray:

@@ -71,10 +71,12 @@ def apply_row_edit(scene: Scene, rows: RowEdit) -> Scene:
         widths = [(name, int(np.prod(value.shape[1:]))) for name, value in scene.gaussians.items()]
         check_added(added, len(layout.node_counts), len(layout.units), widths)
     source = gather_rows(layout.node_of, added, rows.removed)
-    gaussians = Gaussians(**{
-        name: join_rows(value, None if added is None else getattr(added.gaussians, name), source)
-        for name, value in scene.gaussians.items()
-    })
+    gaussians = Gaussians(
+        **{
+            name: join_rows(value, None if added is None else getattr(added.gaussians, name), source)
+            for name, value in scene.gaussians.items()
+        }
+    )
     units = join_rows(layout.unit_of, None if added is None else added.unit_of, source).astype(np.uint8)
     counts = edited_counts(layout.node_counts, layout.node_of, added, rows.removed)
     displacement = None if scene.displacement is None else scene.displacement.gathered(source)

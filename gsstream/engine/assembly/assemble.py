@@ -11,6 +11,7 @@ from typing import Any
 from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
 from gsstream.core.kinds import METHOD_SLOTS, PART_KINDS
 from gsstream.core.part import Part, unwrapped
+from gsstream.discovery.catalog import Catalog
 from gsstream.engine.assembly.checks import Checks, requested_checks
 from gsstream.engine.assembly.choose_renderer import Chosen, choose_renderer, construct
 from gsstream.engine.assembly.fault import Where
@@ -29,7 +30,6 @@ from gsstream.parts.regularizer.base import Regularizer
 from gsstream.parts.render.base import Renderer
 from gsstream.parts.structure.base import Structure
 from gsstream.parts.update.base import UpdateRule
-from gsstream.plugins.catalog import Catalog
 from gsstream.recipe.check import join_problems, validate
 from gsstream.recipe.document import KeyPath, Origin
 from gsstream.recipe.load import ResolvedRecipe
@@ -102,9 +102,11 @@ class Assembly:
 
 
 def assemble(
-    resolved: ResolvedRecipe | Recipe, catalog: Catalog, checks: str | None = None,
+    resolved: ResolvedRecipe | Recipe,
+    catalog: Catalog,
+    checks: str | None = None,
     live: Mapping[str, Part] = MappingProxyType({}),
-) -> Assembly:  # fmt: skip
+) -> Assembly:
     """Import every named part, or take it from ``live`` (slot -> part), check its parameters, and build it.
 
     Raises RecipeError with all that is wrong with the recipe, InputError for a level of checks or a live part that does
@@ -145,10 +147,15 @@ def assemble(
     owners = sorted({entry.distribution for entry in declared if entry})
     recipe = resolved.recipe.model_copy(update=refs)
     return Assembly(
-        recipe=recipe, origins=resolved.origins, distributions=tuple(owners), checks=level,
-        title=title(resolved.recipe, catalog), note=note, **parts,
+        recipe=recipe,
+        origins=resolved.origins,
+        distributions=tuple(owners),
+        checks=level,
+        title=title(resolved.recipe, catalog),
+        note=note,
+        **parts,
         background=BLACK if recipe.background == "auto" else recipe.background,
-    )  # fmt: skip
+    )
 
 
 def _unused_key_messages(paths: list[KeyPath], resolved: ResolvedRecipe) -> list[str]:

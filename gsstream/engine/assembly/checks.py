@@ -84,9 +84,13 @@ class Look:
                 self.values(f"{what} {name}", tensor)
 
     def values(
-        self, what: str, value: torch.Tensor, *, limits: tuple[float, float] | None = None,
+        self,
+        what: str,
+        value: torch.Tensor,
+        *,
+        limits: tuple[float, float] | None = None,
         rows: torch.Tensor | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Raise ComponentError unless every number is finite and within ``limits``; the first that is not is named.
 
         One pass without temporary memory when all is well.

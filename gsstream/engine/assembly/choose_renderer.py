@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import torch
 
 from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
-from gsstream.core.needs import install_extra, install_renderer
+from gsstream.core.install_hints import install_extra, install_renderer
 from gsstream.core.part import Part
-from gsstream.plugins.catalog import Catalog
+from gsstream.discovery.catalog import Catalog
 
 VARIABLE = "GSSTREAM_DEVICE"
 #: What is tried, in this order, before the reference is taken.

@@ -21,9 +21,7 @@ RESIDUAL_KEYS = (
 )  # fmt: skip
 
 
-def unused_keys(
-    recipe: Recipe, method: StreamingMethod[Any], parts: Mapping[str, Any]
-) -> Iterator[KeyPath]:
+def unused_keys(recipe: Recipe, method: StreamingMethod[Any], parts: Mapping[str, Any]) -> Iterator[KeyPath]:
     """Yield the paths of keys that differ from their default though the method does not read them."""
     default = Recipe()
     # An update rule without codes sends no residual in any frame: then nothing asks which gates it would open.

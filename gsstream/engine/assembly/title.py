@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from gsstream.core.errors import GsstreamError
-from gsstream.plugins.catalog import Catalog
+from gsstream.discovery.catalog import Catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import ComponentRef, Recipe
 

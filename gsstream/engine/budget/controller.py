@@ -51,11 +51,14 @@ class Controller:
         if not numbers.get("iterations") and "budget" not in numbers:
             return
         used = numbers.get("budget") or {
-            "rd_lambda": budget.plan.rd_lambda, "estimate": 0.0, "stopped_by_clock": False,
-            "untrimmed": len(step.packet.data), "dropped": {},
+            "rd_lambda": budget.plan.rd_lambda,
+            "estimate": 0.0,
+            "stopped_by_clock": False,
+            "untrimmed": len(step.packet.data),
+            "dropped": {},
             "before": log.seconds("change", "motion", "confidence"),
             "optimise": log.seconds("optimise"),
-        }  # fmt: skip
+        }
         used = {**used, "parts": log.seconds("motion", "growth")}
         log.set(budget=spent(budget, used, self._stream, numbers.get("iterations", 0) / views))
 
@@ -99,26 +102,31 @@ class Controller:
             self._history = (*self._history, past)[-WINDOW:]
 
 
-def apply_plan(parts: Assembly, budget: FrameBudget) -> Assembly:
+def apply_plan(assembly: Assembly, budget: FrameBudget) -> Assembly:
     """Return the parts with the recipe of one frame: the plan's epochs, threshold and weight."""
     assert isinstance(budget, Allowance)
     frame_plan = budget.plan
     changes = {
-        "epochs": frame_plan.epochs, "change_threshold": frame_plan.change_threshold,
+        "epochs": frame_plan.epochs,
+        "change_threshold": frame_plan.change_threshold,
         "rd_lambda": frame_plan.rd_lambda,
-    }  # fmt: skip
-    recipe = parts.recipe
-    return replace(parts, recipe=recipe.model_copy(update={"stream": recipe.stream.model_copy(update=changes)}))
+    }
+    recipe = assembly.recipe
+    return replace(assembly, recipe=recipe.model_copy(update={"stream": recipe.stream.model_copy(update=changes)}))
 
 
 def usage(pace: Schedule, fitted: TrimmedDelta) -> dict[str, Any]:
     """Return what the optimisation of a frame used, and what fitting its packet gave up: raw numbers for the log."""
     assert isinstance(pace, EpochScheduler)
     return {
-        "rd_lambda": pace.mean_rate_weight, "estimate": pace.estimate, "stopped_by_clock": pace.stopped_by_clock,
-        "untrimmed": fitted.untrimmed, "before": pace.before, "optimise": pace.optimise,
+        "rd_lambda": pace.mean_rate_weight,
+        "estimate": pace.estimate,
+        "stopped_by_clock": pace.stopped_by_clock,
+        "untrimmed": fitted.untrimmed,
+        "before": pace.before,
+        "optimise": pace.optimise,
         "dropped": {"symbols": fitted.symbols, "gates": fitted.gates, "added": fitted.added},
-    }  # fmt: skip
+    }
 
 
 def spent(budget: Allowance, used: Mapping[str, Any], stream: Stream, epochs: float) -> dict[str, Any]:
@@ -150,10 +158,16 @@ def spent(budget: Allowance, used: Mapping[str, Any], stream: Stream, epochs: fl
         "binding": binding,
         "reduced": reduced,
         "usage": {
-            "epochs": epochs, "planned_epochs": plan.epochs, "rd_lambda": used["rd_lambda"],
-            "step_scale": plan.step_scale, "change_threshold": plan.change_threshold,
-            "estimated_bytes": used["estimate"], "untrimmed_bytes": used["untrimmed"],
-            "seconds_before": used["before"], "seconds_optimise": used["optimise"],
-            "parts": used["parts"], "part_scale": plan.part_scale,
+            "epochs": epochs,
+            "planned_epochs": plan.epochs,
+            "rd_lambda": used["rd_lambda"],
+            "step_scale": plan.step_scale,
+            "change_threshold": plan.change_threshold,
+            "estimated_bytes": used["estimate"],
+            "untrimmed_bytes": used["untrimmed"],
+            "seconds_before": used["before"],
+            "seconds_optimise": used["optimise"],
+            "parts": used["parts"],
+            "part_scale": plan.part_scale,
         },
-    }  # fmt: skip
+    }

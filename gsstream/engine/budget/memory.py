@@ -34,15 +34,15 @@ def min_memory(info: SourceInfo, recipe: Recipe) -> int:
     return _fixed(info, recipe) + round(MIN_GAUSSIANS * BYTES_PER_GAUSSIAN / FOR_GAUSSIANS)
 
 
-def limit_memory(parts: Assembly, info: SourceInfo) -> Assembly:
+def limit_memory(assembly: Assembly, info: SourceInfo) -> Assembly:
     """Return the parts with so few Gaussians and so small a cache of the renderer that the memory budget holds.
 
     Raises InputError when the budget is below what any run of this recording needs.
     """
-    memory = parts.recipe.budget.memory
+    memory = assembly.recipe.budget.memory
     if memory is None:
-        return parts
-    least = min_memory(info, parts.recipe)
+        return assembly
+    least = min_memory(info, assembly.recipe)
     if memory < least:
         raise InputError(
             f"budget.memory: {memory / 1e6:.0f} MB, but a run of this recording needs at least "
@@ -50,25 +50,25 @@ def limit_memory(parts: Assembly, info: SourceInfo) -> Assembly:
             f"{len(info.train)} training cameras of {info.train.width} x {info.train.height} pixels and "
             f"{MIN_GAUSSIANS} Gaussians); give more, or lower --scale"
         )
-    free, first = memory - _fixed(info, parts.recipe), parts.recipe.first_frame
+    free, first = memory - _fixed(info, assembly.recipe), assembly.recipe.first_frame
     most = min(first.max_gaussians, round(FOR_GAUSSIANS * free) // BYTES_PER_GAUSSIAN)
-    recipe = parts.recipe.model_copy(update={"first_frame": first.model_copy(update={"max_gaussians": most})})
-    parts = replace(parts, recipe=recipe)
-    return _with_cache(parts, (free - most * BYTES_PER_GAUSSIAN_LATER) / 1e6)
+    recipe = assembly.recipe.model_copy(update={"first_frame": first.model_copy(update={"max_gaussians": most})})
+    assembly = replace(assembly, recipe=recipe)
+    return _with_cache(assembly, (free - most * BYTES_PER_GAUSSIAN_LATER) / 1e6)
 
 
-def _with_cache(parts: Assembly, megabytes: float) -> Assembly:
+def _with_cache(assembly: Assembly, megabytes: float) -> Assembly:
     """The renderer with at most this much cache, where it has such a setting."""
-    config = parts.renderer.config
+    config = assembly.renderer.config
     if "cache_mb" not in type(config).model_fields:
-        return parts
+        return assembly
     given = getattr(config, "cache_mb")  # noqa: B009  # a setting of some renderers alone
     cache = round(megabytes if given is None else min(megabytes, given), 1)
     config = type(config)(**{**config.model_dump(), "cache_mb": cache})
-    ref = parts.recipe.renderer.model_copy(update={"params": config.model_dump(mode="json")})
-    recipe = parts.recipe.model_copy(update={"renderer": ref})
-    renderer: Any = type(parts.part("renderer"))(config)
-    return replace(parts, recipe=recipe, renderer=renderer)
+    ref = assembly.recipe.renderer.model_copy(update={"params": config.model_dump(mode="json")})
+    recipe = assembly.recipe.model_copy(update={"renderer": ref})
+    renderer: Any = type(assembly.part("renderer"))(config)
+    return replace(assembly, recipe=recipe, renderer=renderer)
 
 
 def _fixed(info: SourceInfo, recipe: Recipe) -> int:

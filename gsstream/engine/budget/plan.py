@@ -69,15 +69,21 @@ def read_past_frame(metrics: Mapping[str, Any]) -> Past | None:
     if usage is None:
         return None
     return Past(
-        frame=int(metrics["frame"]), epochs=float(usage["epochs"]),
+        frame=int(metrics["frame"]),
+        epochs=float(usage["epochs"]),
         candidates=int(metrics.get("candidate_gaussians", metrics["num_gaussians"])),
-        before=float(usage["seconds_before"]), optimise=float(usage["seconds_optimise"]),
+        before=float(usage["seconds_before"]),
+        optimise=float(usage["seconds_optimise"]),
         after=float(usage["seconds"]) - float(usage["seconds_before"]) - float(usage["seconds_optimise"]),
-        weight=float(usage["rd_lambda"]), step_scale=float(usage["step_scale"]),
-        threshold=float(usage["change_threshold"]), estimate=float(usage["estimated_bytes"]),
-        untrimmed=int(usage["untrimmed_bytes"]), size=sum(metrics["bytes"].values()),
-        parts=float(usage["parts"]), part_scale=float(usage["part_scale"]),
-    )  # fmt: skip
+        weight=float(usage["rd_lambda"]),
+        step_scale=float(usage["step_scale"]),
+        threshold=float(usage["change_threshold"]),
+        estimate=float(usage["estimated_bytes"]),
+        untrimmed=int(usage["untrimmed_bytes"]),
+        size=sum(metrics["bytes"].values()),
+        parts=float(usage["parts"]),
+        part_scale=float(usage["part_scale"]),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,8 +220,8 @@ def _step_scale(recent: Sequence[Past]) -> float:
         return 1.0
     last = recent[-1]
     if last.weight >= 0.5 * MAX_WEIGHT and last.untrimmed > last.size:
-        return min(2 ** 0.5 * last.step_scale, MAX_STEP_SCALE)
-    return max(1.0, last.step_scale / 2 ** 0.5) if last.weight < 0.1 * MAX_WEIGHT else last.step_scale
+        return min(2**0.5 * last.step_scale, MAX_STEP_SCALE)
+    return max(1.0, last.step_scale / 2**0.5) if last.weight < 0.1 * MAX_WEIGHT else last.step_scale
 
 
 def _correction(recent: Sequence[Past]) -> float:

@@ -43,9 +43,13 @@ class TrimmedDelta:
 
 
 def trim_to_size(
-    delta: Delta, packet: EncodedPacket, curvature: Mapping[str, FloatArray], layout: Layout,
-    encode: Callable[[Delta], EncodedPacket], max_bytes: int,
-) -> TrimmedDelta:  # fmt: skip
+    delta: Delta,
+    packet: EncodedPacket,
+    curvature: Mapping[str, FloatArray],
+    layout: Layout,
+    encode: Callable[[Delta], EncodedPacket],
+    max_bytes: int,
+) -> TrimmedDelta:
     """Return the delta, with as little given up as makes its packet fit; unchanged when it fits already."""
     untrimmed = len(packet.data)
     if untrimmed <= max_bytes:
@@ -64,9 +68,13 @@ def trim_to_size(
 
 
 def _trimmed(
-    delta: Delta, packet: EncodedPacket, curvature: Mapping[str, FloatArray], layout: Layout,
-    encode: Callable[[Delta], EncodedPacket], max_bytes: int,
-) -> tuple[Delta, EncodedPacket] | None:  # fmt: skip
+    delta: Delta,
+    packet: EncodedPacket,
+    curvature: Mapping[str, FloatArray],
+    layout: Layout,
+    encode: Callable[[Delta], EncodedPacket],
+    max_bytes: int,
+) -> tuple[Delta, EncodedPacket] | None:
     """The largest packet found that fits, real bytes; None when none did."""
     assert delta.residual is not None
     table = _Table(delta.residual, curvature, layout)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from gsstream.core.gaussians import Gaussians
-from gsstream.engine.fit.schedule import PRUNE_OPACITY
+from gsstream.engine.fit.constants import PRUNE_OPACITY
 from gsstream.parts.optimiser.row_parameters import TopologyEdit
 from gsstream.parts.render.activations import activate_opacities, activate_scales, rotation_matrices
 

@@ -17,9 +17,16 @@ class TrainedGates:
     """Logits of the gates that have candidates (``rows`` [A]) behind them, moved by images and penalty."""
 
     def __init__(
-        self, gate: GateSampler, regularizer: Regularizer, optimiser: RowOptimiser, lr: float, logits: torch.Tensor,
-        hierarchy: Hierarchy, rows: torch.Tensor, generator: torch.Generator,
-    ) -> None:  # fmt: skip
+        self,
+        gate: GateSampler,
+        regularizer: Regularizer,
+        optimiser: RowOptimiser,
+        lr: float,
+        logits: torch.Tensor,
+        hierarchy: Hierarchy,
+        rows: torch.Tensor,
+        generator: torch.Generator,
+    ) -> None:
         self.gate, self.regularizer, self.lr = gate, regularizer, lr
         self.num_gaussians, self._generator, self._all = hierarchy.num_gaussians, generator, logits
         self._nodes, node_of = torch.unique(hierarchy.node_of[rows], return_inverse=True)

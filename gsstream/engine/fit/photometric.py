@@ -18,9 +18,7 @@ from gsstream.parts.render.target import ViewTarget
 class PhotometricLoss:
     """The photometric loss of one frame's views; ``dssim`` is the weight of 1 - SSIM."""
 
-    def __init__(
-        self, loss: Loss, dssim: float, images: FrameImages, exposure: Exposure | None
-    ) -> None:
+    def __init__(self, loss: Loss, dssim: float, images: FrameImages, exposure: Exposure | None) -> None:
         self._loss, self._dssim, self.images, self.exposure = loss, dssim, images, exposure
         self._takes_bytes = loss.claims().takes_bytes
         self._prepared: dict[int, Any] = {}
@@ -35,9 +33,13 @@ class PhotometricLoss:
 
 
 def render_exposed(
-    renderer: Renderer, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int,
-    background: tuple[float, float, float], exposure: Exposure | None,
-) -> torch.Tensor:  # fmt: skip
+    renderer: Renderer,
+    gaussians: Gaussians[torch.Tensor],
+    cameras: Cameras,
+    view: int,
+    background: tuple[float, float, float],
+    exposure: Exposure | None,
+) -> torch.Tensor:
     """Return [H, W, 3]: a scene as the camera of this view records it; no graph."""
     with torch.no_grad():
         image = renderer.render(gaussians, cameras, view, background).image

@@ -33,7 +33,7 @@ from gsstream.parts.structure.base import Anchors
 CARRIED = ("exposure", "origin")
 
 
-def begin(parts: Assembly, frame: Frame, tools: Tools) -> Step:
+def begin(assembly: Assembly, frame: Frame, tools: Tools) -> Step:
     """Reconstruct frame 0 and write it as a key packet.
 
     Its seeds (``tools.points``) are never derived from test cameras; the fitted exposure is added to ``tools.meta``.
@@ -41,33 +41,33 @@ def begin(parts: Assembly, frame: Frame, tools: Tools) -> Step:
     check_cameras(frame.cameras, 1, "a frame")
     log, rng = tools.log, tools.rng
     with log.phase("seed"):
-        anchors = seed_anchors(parts, tools.points(frame), frame)
+        anchors = seed_anchors(assembly, tools.points(frame), frame)
     with log.phase("optimise"):
-        start, levels = initial_gaussians(anchors, parts.recipe.first_frame), anchors.levels
-        if parts.recipe.first_frame.shell:
+        start, levels = initial_gaussians(anchors, assembly.recipe.first_frame), anchors.levels
+        if assembly.recipe.first_frame.shell:
             start, levels = with_shell(start, levels, frame)
-        found = optimise_first_frame(start, levels, frame, parts, rng, tools.progress)
+        found = optimise_first_frame(start, levels, frame, assembly, rng, tools.progress)
     with log.phase("code"):
         # Positions are float32 in the packet too, so the hierarchy of the decoded scene is the one built here.
-        cheaper = rd_quantise(parts, found.gaussians, frame, found.exposure, rng)
+        cheaper = rd_quantise(assembly, found.gaussians, frame, found.exposure, rng)
         decoded = quantise_key(cheaper.map(lambda t: t.numpy())).map(torch.from_numpy)
-        hierarchy, levels, decoded = sort_into_nodes(parts, decoded, found.levels, anchors)
+        hierarchy, levels, decoded = sort_into_nodes(assembly, decoded, found.levels, anchors)
         layout = make_layout(hierarchy, levels, anchors)
-        first = first_layer_mask(parts, decoded, frame, found.exposure, rng)
+        first = first_layer_mask(assembly, decoded, frame, found.exposure, rng)
         meta = key_meta(tools.meta(frame), found.exposure, anchors.origin)
-        state, packet = key_state(parts, decoded, layout, hierarchy, frame, meta, rng, first)
+        state, packet = key_state(assembly, decoded, layout, hierarchy, frame, meta, rng, first)
     log.set(iterations=found.iterations)
     return Step(state, packet, "key")
 
 
-def seed_anchors(parts: Assembly, points: PointCloud, frame: Frame) -> Anchors:
+def seed_anchors(assembly: Assembly, points: PointCloud, frame: Frame) -> Anchors:
     """Return anchors, at most as many as frame 0 may have Gaussians.
 
     A structure places one or more for each point, so where there are too many it is given fewer points.
     """
-    most = parts.recipe.first_frame.max_gaussians
+    most = assembly.recipe.first_frame.max_gaussians
     while True:
-        anchors = parts.structure.seed(points, frame.cameras)
+        anchors = assembly.structure.seed(points, frame.cameras)
         if len(anchors.positions) <= most or len(points) == 1:
             return anchors
         points = thin_points(points, max(1, int(0.95 * len(points) * most / len(anchors.positions))))
@@ -101,11 +101,11 @@ def decoded_anchors(player: PlayerState) -> Anchors:
 
 
 def sort_into_nodes(
-    parts: Assembly, gaussians: Gaussians[torch.Tensor], levels: torch.Tensor, anchors: Anchors
+    assembly: Assembly, gaussians: Gaussians[torch.Tensor], levels: torch.Tensor, anchors: Anchors
 ) -> tuple[Hierarchy, torch.Tensor, Gaussians[torch.Tensor]]:
     """Group the Gaussians and store them node by node: (hierarchy, levels, Gaussians), all in the new order."""
-    hierarchy = parts.structure.build(gaussians, anchors)
-    with error_context("structure", parts.part("structure"), parts.where):
+    hierarchy = assembly.structure.build(gaussians, anchors)
+    with error_context("structure", assembly.part("structure"), assembly.where):
         hierarchy.validate()
     edit = sort_by_node(hierarchy.node_of)
     return hierarchy.rows(edit.source), levels[edit.source], gaussians.rows(edit.source)
@@ -122,7 +122,7 @@ def make_layout(hierarchy: Hierarchy, levels: torch.Tensor, anchors: Anchors) ->
 
 
 def key_state(
-    parts: Assembly,
+    assembly: Assembly,
     gaussians: Gaussians[torch.Tensor],
     layout: Layout,
     hierarchy: Hierarchy,
@@ -135,11 +135,15 @@ def key_state(
     arrays: Gaussians[FloatArray] = gaussians.map(lambda t: np.ascontiguousarray(t.numpy()))
     packet = encode_key(KeyState(arrays, layout, meta), frame=frame.index, first=first)
     player = decode_packet(None, packet.data)
-    decoders = parts.update.init_decoders(gaussians, rng.stream("decoders", frame.index))
+    decoders = assembly.update.init_decoders(gaussians, rng.stream("decoders", frame.index))
     state = StreamState(
-        player=player, hierarchy=hierarchy, previous=frame, decoders=decoders,
-        exposure=exposure_from_meta(player.meta), key_frame=player.frame,
-    )  # fmt: skip
+        player=player,
+        hierarchy=hierarchy,
+        previous=frame,
+        decoders=decoders,
+        exposure=exposure_from_meta(player.meta),
+        key_frame=player.frame,
+    )
     return state, replace(packet, decoded=player)
 
 

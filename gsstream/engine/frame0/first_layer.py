@@ -15,14 +15,14 @@ from gsstream.parts.render.exposure import Exposure
 
 
 def first_layer_mask(
-    parts: Assembly, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None, rng: Rng
+    assembly: Assembly, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None, rng: Rng
 ) -> BoolArray | None:
     """Return the choice [N] bool of the Gaussians that come first, or None where the packet is to have no layers."""
-    share = parts.recipe.codec.first_layer
+    share = assembly.recipe.codec.first_layer
     if share == 1 or len(gaussians) == 0:
         return None
     generator = rng.stream("first layer", frame.index)
-    views = TrainingViews(parts.renderer, frame, exposure, parts.background)
+    views = TrainingViews(assembly.renderer, frame, exposure, assembly.background)
     # One probe of a camera is enough for an order: with four the first layer shows 0.1 dB more, and a large picture
     # takes a second longer.
     errors, _ = removal_errors(views, gaussians, generator, probes=1)

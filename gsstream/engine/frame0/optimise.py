@@ -20,7 +20,7 @@ from gsstream.core.picture_size import area_price, densify_factor, prune_factor
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import VARIABLE, Checks, Look
-from gsstream.engine.fit import schedule
+from gsstream.engine.fit import constants
 from gsstream.engine.fit.densify import DensifyStatistics, GrowthLimits, grow_and_prune
 from gsstream.engine.fit.exposure import ExposureFit
 from gsstream.engine.fit.frame_images import FrameImages
@@ -62,7 +62,7 @@ def initial_gaussians(anchors: Anchors, settings: FirstFrame) -> Gaussians[torch
         raise InputError("the structure placed no anchors: expected at least 1 Gaussian to start from, got 0")
     spacing = neighbour_distance(anchors.positions).clamp(1e-6, 1e6)
     higher = (settings.sh_degree + 1) ** 2 - 1
-    return isotropic(anchors.positions, anchors.colors, spacing.log(), schedule.OPACITY, higher)
+    return isotropic(anchors.positions, anchors.colors, spacing.log(), constants.OPACITY, higher)
 
 
 def isotropic(
@@ -87,8 +87,13 @@ def isotropic(
 
 def first_frame_lrs(settings: FirstFrame, extent: float) -> dict[str, float]:
     """Return the learning rate of every attribute at the start of frame 0."""
-    rates = {"quats": schedule.LR_QUATS, "scales": schedule.LR_SCALES, "opacities": schedule.LR_OPACITIES,
-             "sh0": schedule.LR_SH0, "shN": schedule.LR_SHN}  # fmt: skip
+    rates = {
+        "quats": constants.LR_QUATS,
+        "scales": constants.LR_SCALES,
+        "opacities": constants.LR_OPACITIES,
+        "sh0": constants.LR_SH0,
+        "shN": constants.LR_SHN,
+    }
     return {"means": settings.lr_means * extent, **{name: settings.lr_factor * lr for name, lr in rates.items()}}
 
 
@@ -96,16 +101,16 @@ def optimise_first_frame(
     start: Gaussians[torch.Tensor],
     levels: torch.Tensor,
     frame: Frame,
-    parts: Assembly,
+    assembly: Assembly,
     rng: Rng,
     progress: Progress,
 ) -> Reconstruction:
     """Fit frame 0 on its training images."""
-    settings = parts.recipe.first_frame
+    settings = assembly.recipe.first_frame
     iterations = min(settings.epochs * len(frame.cameras), settings.max_iterations)
     pyramid = plan_pyramid(frame.cameras.width, iterations, settings)
     # The name of this random stream is that of older versions, so that a seed still gives the same frame 0.
-    run = FirstFrameRun(start, levels, frame, parts, rng.stream("root", frame.index), pyramid)
+    run = FirstFrameRun(start, levels, frame, assembly, rng.stream("root", frame.index), pyramid)
     run.exposure = ExposureFit.start(len(frame.cameras), run.device) if settings.exposure else None
     for level in pyramid.levels:
         run.enter(level)
@@ -113,8 +118,8 @@ def optimise_first_frame(
             progress(iteration, pyramid.iterations, run.smooth, len(run.levels))
     exposure = run.exposure.centered().exposure.to(CPU) if run.exposure else None
     found = run.gaussians().map(lambda value: value.detach().to(CPU))
-    parts.where.enter(frame.index)
-    look = Look(parts.checks, "first frame", run.table, parts.where)
+    assembly.where.enter(frame.index)
+    look = Look(assembly.checks, "first frame", run.table, assembly.where)
     for name, values in found.items():
         look.values(f"{name} after the last iteration ({VARIABLE}=step finds the first)", values)
     return Reconstruction(found, run.levels.to(CPU), exposure, pyramid.iterations)
@@ -127,27 +132,32 @@ class FirstFrameRun:
         start: [N] Gaussians; ``levels`` [N] their octree levels.
         levels: see above.
         frame: training images at their own size.
-        parts: the live parts of the recipe.
+        assembly: the live parts of the recipe.
         generator: of the order of views, of splits and of noise.
         pyramid: the whole schedule, of which :meth:`step` makes one iteration; it is on its first level.
     """
 
     def __init__(
-        self, start: Gaussians[torch.Tensor], levels: torch.Tensor, frame: Frame, parts: Assembly,
-        generator: torch.Generator, pyramid: Pyramid,
-    ) -> None:  # fmt: skip
-        self.parts, self.recipe, self.whole = parts, parts.recipe, frame
-        self.settings = parts.recipe.first_frame
-        self.renderer, self.device = parts.renderer, parts.renderer.device
+        self,
+        start: Gaussians[torch.Tensor],
+        levels: torch.Tensor,
+        frame: Frame,
+        assembly: Assembly,
+        generator: torch.Generator,
+        pyramid: Pyramid,
+    ) -> None:
+        self.assembly, self.recipe, self.whole = assembly, assembly.recipe, frame
+        self.settings = assembly.recipe.first_frame
+        self.renderer, self.device = assembly.renderer, assembly.renderer.device
         self.levels = levels.to(self.device)
         self.views = len(frame.cameras)
         self.extent = frame.cameras.extent
-        self.widest = schedule.MAX_SCALE * self.extent
+        self.widest = constants.MAX_SCALE * self.extent
         if self.settings.shell:
-            self.widest = max(self.widest, schedule.MAX_SHELL_SCALE * find_shell(frame.cameras).sigma)
+            self.widest = max(self.widest, constants.MAX_SHELL_SCALE * find_shell(frame.cameras).sigma)
         self.pyramid, self.iterations, self.generator = pyramid, pyramid.iterations, generator
         values = {name: value.to(self.device) for name, value in start.items()}
-        self.table = RowParameters(values, first_frame_lrs(self.settings, self.extent), parts.optimiser)
+        self.table = RowParameters(values, first_frame_lrs(self.settings, self.extent), assembly.optimiser)
         self._set_level(pyramid.levels[0], None)
         #: Colour maps that are fitted along; None: those of the photometric loss stay.
         self.exposure: ExposureFit | None = None
@@ -176,7 +186,7 @@ class FirstFrameRun:
     def _set_level(self, level: PyramidLevel, exposure: Exposure | None) -> None:
         self.level, self.frame = level, shrink_frame(self.whole, level.factor)
         self.photometric = PhotometricLoss(
-            self.parts.loss, schedule.DSSIM, FrameImages(self.frame.images, self.device), exposure
+            self.assembly.loss, constants.DSSIM, FrameImages(self.frame.images, self.device), exposure
         )
         self.smooth_depth = SmoothDepth(self.renderer, self.frame, self.device)
         self.half_size = torch.tensor([self.frame.cameras.width / 2, self.frame.cameras.height / 2]).to(self.device)
@@ -189,7 +199,7 @@ class FirstFrameRun:
         at_once = 1 if self.device == CPU else self.views
         for begin in range(first, last + 1, at_once):
             numbers = range(begin, min(begin + at_once, last + 1))
-            with deferred_checks(self.parts.checks is not Checks.STEP):
+            with deferred_checks(self.assembly.checks is not Checks.STEP):
                 for iteration in numbers:
                     self.step(iteration)
             self._read_losses()
@@ -202,9 +212,9 @@ class FirstFrameRun:
 
     def step(self, iteration: int) -> None:
         """Make one iteration on one view."""
-        view, self.parts.where.iteration = self._next_view(), iteration
+        view, self.assembly.where.iteration = self._next_view(), iteration
         last = self.pyramid.densify_until * self.iterations
-        densify = iteration + schedule.DENSIFY_EVERY >= schedule.DENSIFY_FROM and iteration <= last
+        densify = iteration + constants.DENSIFY_EVERY >= constants.DENSIFY_FROM and iteration <= last
         scene = self.gaussians().map(torch.Tensor.detach)
         rows, keep = self.dropout.thin_out(self._disturbed(scene))
         wrt = WrtScene(rows, densify, exposure=self.exposure is not None, keep=keep)
@@ -217,7 +227,7 @@ class FirstFrameRun:
         self.table.step(dict(found.grad.items()))
         if found.means2d is not None:
             self.statistics = self.statistics.add(found.means2d * self.half_size)
-            if iteration >= schedule.DENSIFY_FROM and iteration % schedule.DENSIFY_EVERY == 0:
+            if iteration >= constants.DENSIFY_FROM and iteration % constants.DENSIFY_EVERY == 0:
                 self._densify()
         if self.settings.prune_error > 0 and iteration in [int(n * self.iterations) for n in self.pyramid.prune_at]:
             self._prune()
@@ -235,7 +245,7 @@ class FirstFrameRun:
         """Loss of a view and its gradients, and the exposure step."""
         if self.exposure:
             self.photometric.exposure = self.exposure.exposure
-        session = self.renderer.open(wrt.values, None, self.frame.cameras, self.parts.background)
+        session = self.renderer.open(wrt.values, None, self.frame.cameras, self.assembly.background)
         found = session.loss_and_grad(view, self.photometric.view_target(view), wrt)
         if self.exposure and found.exposure is not None:
             self.exposure = self.exposure.step(view, found.exposure, lr=0.005, identity_weight=1e-3)
@@ -250,7 +260,7 @@ class FirstFrameRun:
 
     def _densify(self) -> None:
         gaussians = self.gaussians().map(torch.Tensor.detach)
-        gradient = schedule.DENSIFY_GRADIENT * densify_factor(self.whole.cameras.width)
+        gradient = constants.DENSIFY_GRADIENT * densify_factor(self.whole.cameras.width)
         limits = GrowthLimits(gradient, self.settings.max_gaussians, self.extent, self.widest)
         edit, values = grow_and_prune(gaussians, self.statistics, limits, self.generator)
         self.table.edit(edit, values)
@@ -261,7 +271,7 @@ class FirstFrameRun:
         """Drop what the images would not miss; what remains has time to close the gaps."""
         gaussians = self.gaussians().map(torch.Tensor.detach)
         exposure = self.exposure.exposure if self.exposure else self.photometric.exposure
-        views = TrainingViews(self.renderer, self.frame, exposure, self.parts.background)
+        views = TrainingViews(self.renderer, self.frame, exposure, self.assembly.background)
         least = self.settings.prune_error * prune_factor(self.whole.cameras.width)
         rows = prune_by_error(views, gaussians, self.generator, least)
         self.table.select_rows(rows)

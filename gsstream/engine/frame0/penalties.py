@@ -13,7 +13,7 @@ import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import Gaussians
-from gsstream.engine.fit import schedule
+from gsstream.engine.fit import constants
 from gsstream.parts.render.reference import ALPHA_CUT
 
 #: Squared distance, in squared scene units, below which a Gaussian is taken to stand at it.
@@ -47,8 +47,8 @@ def add_penalty_grad(
     count = max(1, len(scene))
     drawn = gradients.opacities != 0
     opacity, sizes = scene.opacities.sigmoid(), scene.scales.exp()
-    gradients.opacities.add_(opacity * (1 - opacity), alpha=schedule.OPACITY_PENALTY / count)
-    gradients.scales.add_(sizes, alpha=schedule.SCALE_PENALTY / (3 * count * extent))
+    gradients.opacities.add_(opacity * (1 - opacity), alpha=constants.OPACITY_PENALTY / count)
+    gradients.scales.add_(sizes, alpha=constants.SCALE_PENALTY / (3 * count * extent))
     if area_price == 0:
         return
     # Axis by axis, each in a row of its own: numbers by row and by axis are slow to multiply.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud, join_frames, shrink_frame
-from gsstream.core.signs import Tell, silent
-from gsstream.engine.fit import schedule
+from gsstream.core.progress import Tell, silent
+from gsstream.engine.fit import constants
 from gsstream.input.recordings.base import FrameSource
 from gsstream.input.recordings.depth_maps import read_depth_maps
 from gsstream.input.seeds.seeding import photo_consistent_seeds
@@ -26,7 +26,7 @@ def gather_points(source: FrameSource | None, frame: Frame, settings: FirstFrame
     Raises InputError when the recipe asks for a kind of points that the recording does not have, or finds none.
     """
     pixels = frame.images[..., 0].size
-    limit = min(settings.max_points, max(1, pixels // schedule.PIXELS_PER_SEED))
+    limit = min(settings.max_points, max(1, pixels // constants.PIXELS_PER_SEED))
     return thin_points(_base_points(source, frame, settings, tell), limit)
 
 

@@ -15,7 +15,7 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.picture_size import WIDTH
-from gsstream.engine.fit import schedule
+from gsstream.engine.fit import constants
 from gsstream.parts.render.reference import BLUR
 from gsstream.recipe.model import FirstFrame
 
@@ -68,8 +68,8 @@ class Pyramid:
 
 def one_size(iterations: int, settings: FirstFrame) -> Pyramid:
     """Return the schedule on pictures of their own size alone."""
-    level = PyramidLevel(1, 0, iterations, settings.lr_means, settings.lr_means / schedule.LR_MEANS_FALL)
-    return Pyramid((level,), schedule.DENSIFY_UNTIL, schedule.PRUNE_AT)
+    level = PyramidLevel(1, 0, iterations, settings.lr_means, settings.lr_means / constants.LR_MEANS_FALL)
+    return Pyramid((level,), constants.DENSIFY_UNTIL, constants.PRUNE_AT)
 
 
 def plan_pyramid(width: int, iterations: int, settings: FirstFrame) -> Pyramid:
@@ -84,10 +84,10 @@ def plan_pyramid(width: int, iterations: int, settings: FirstFrame) -> Pyramid:
     levels = list[PyramidLevel]()
     for number, (share, (first, last)) in enumerate(zip(shares, RATES[-count:], strict=True)):
         first_lr = settings.lr_means * (first if number else 1.0)
-        last_lr = 2 * settings.lr_means / schedule.LR_MEANS_FALL if last is None else last * settings.lr_means
+        last_lr = 2 * settings.lr_means / constants.LR_MEANS_FALL if last is None else last * settings.lr_means
         begin = levels[-1].end if levels else 0
         levels.append(PyramidLevel(2 ** (count - 1 - number), begin, share, first_lr, last_lr))
-    return Pyramid(tuple(levels), schedule.PYRAMID_DENSIFY_UNTIL, schedule.PYRAMID_PRUNE_AT)
+    return Pyramid(tuple(levels), constants.PYRAMID_DENSIFY_UNTIL, constants.PYRAMID_PRUNE_AT)
 
 
 def keep_widths(gaussians: Gaussians[torch.Tensor], cameras: Cameras, before: int, now: int) -> torch.Tensor:

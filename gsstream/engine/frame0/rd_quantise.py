@@ -31,14 +31,14 @@ HUTCHINSON_SAMPLES = 2
 
 
 def rd_quantise(
-    parts: Assembly, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None, rng: Rng
+    assembly: Assembly, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None, rng: Rng
 ) -> Gaussians[torch.Tensor]:
     """Return Gaussians that look nearly the same and that a key packet holds in fewer bytes."""
     rows = nearest_axes(gaussians)
-    rate = parts.recipe.codec.key_rd_lambda
+    rate = assembly.recipe.codec.key_rd_lambda
     if rate == 0 or len(rows) == 0:
         return rows
-    sensitivity, error = code_sensitivity(parts, rows, frame, exposure, rng.stream("key rate", frame.index))
+    sensitivity, error = code_sensitivity(assembly, rows, frame, exposure, rng.stream("key rate", frame.index))
     return Gaussians(
         means=rows.means,
         **{
@@ -50,16 +50,19 @@ def rd_quantise(
 
 
 def code_sensitivity(
-    parts: Assembly, gaussians: Gaussians[torch.Tensor], frame: Frame, exposure: Exposure | None,
+    assembly: Assembly,
+    gaussians: Gaussians[torch.Tensor],
+    frame: Frame,
+    exposure: Exposure | None,
     generator: torch.Generator,
-) -> tuple[dict[str, FloatArray], float]:  # fmt: skip
+) -> tuple[dict[str, FloatArray], float]:
     """Return the sensitivity of the training images to each code, and their mean squared error.
 
     Returns attribute -> [N, width] float64: squared change of all images together when a code is one higher.
     """
     sensitivity: dict[str, FloatArray] = {name: np.zeros(_flat(getattr(gaussians, name)).shape) for name in KEY_BITS}
     error = 0.0
-    views = TrainingViews(parts.renderer, frame, exposure, parts.background)
+    views = TrainingViews(assembly.renderer, frame, exposure, assembly.background)
     for probe in hutchinson_samples(views, gaussians, generator, each=HUTCHINSON_SAMPLES):
         error += probe.error
         for name, bits in KEY_BITS.items():

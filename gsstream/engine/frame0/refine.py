@@ -35,16 +35,16 @@ from gsstream.recipe.model import Stream
 SHOWN = "shown"
 
 
-def refine_first_frame(parts: Assembly, state: StreamState, step: Step, frame: Frame, tools: Tools) -> Step:
+def refine_first_frame(assembly: Assembly, state: StreamState, step: Step, frame: Frame, tools: Tools) -> Step:
     """Return a step whose state has the refinement after this frame; as it is where the recipe asks for none.
 
     ``state`` is that before the frame. A frame that is skipped only moves what is refined.
     """
-    if not is_refining(parts.recipe.stream, state):
+    if not is_refining(assembly.recipe.stream, state):
         return step
     with tools.log.phase("refine"):
         after, before = step.state, state.refinement or start_refinement(state.player)
-        found = advance_refinement(parts, before, state.player, after.player, frame, state.exposure, tools.rng)
+        found = advance_refinement(assembly, before, state.player, after.player, frame, state.exposure, tools.rng)
     tools.log.set(refine_iterations=found.iterations - before.iterations)
     return replace(step, state=replace(after, refinement=found))
 
@@ -81,16 +81,21 @@ def start_refinement(player: PlayerState) -> Refinement:
 
 
 def advance_refinement(
-    parts: Assembly, refinement: Refinement, before: PlayerState, after: PlayerState, frame: Frame,
-    exposure: Exposure | None, rng: Rng,
-) -> Refinement:  # fmt: skip
+    assembly: Assembly,
+    refinement: Refinement,
+    before: PlayerState,
+    after: PlayerState,
+    frame: Frame,
+    exposure: Exposure | None,
+    rng: Rng,
+) -> Refinement:
     """Return the refinement after a frame: moved as the stream moved, and optimised on the frame's pictures."""
-    start, stream = track_motion(refinement, before, after), parts.recipe.stream
+    start, stream = track_motion(refinement, before, after), assembly.recipe.stream
     if frame.epoch_scale == 0 or is_refined(stream, start):
         return start
     generator = rng.stream("refine", frame.index)
-    pyramid = one_size(_iterations(stream), parts.recipe.first_frame)
-    run = FirstFrameRun(start.gaussians, start.levels, frame, parts, generator, pyramid)
+    pyramid = one_size(_iterations(stream), assembly.recipe.first_frame)
+    run = FirstFrameRun(start.gaussians, start.levels, frame, assembly, generator, pyramid)
     run.photometric.exposure = None if exposure is None else exposure.to(run.device)
     run.statistics = start.statistics.to(run.device)
     for name, held in start.moments.items():

@@ -28,7 +28,7 @@ from gsstream.packet import PlayerState, StreamMeta, quantise_key
 from gsstream.parts.structure.base import Anchors
 
 
-def reuse_first_frame(parts: Assembly, frame: Frame, tools: Tools) -> Step:
+def reuse_first_frame(assembly: Assembly, frame: Frame, tools: Tools) -> Step:
     """Start from the decoded frame 0 of another stream, grouped by this method.
 
     Methods can then be compared on the same scene.
@@ -38,24 +38,24 @@ def reuse_first_frame(parts: Assembly, frame: Frame, tools: Tools) -> Step:
     """
     first, meta, rng = tools.first, tools.meta(frame), tools.rng
     assert first is not None
-    _check_views(first.meta, frame.cameras, () if parts.recipe.data.leak == "training" else meta.test.ids)
-    if first.gaussians.sh_degree != parts.recipe.first_frame.sh_degree:
+    _check_views(first.meta, frame.cameras, () if assembly.recipe.data.leak == "training" else meta.test.ids)
+    if first.gaussians.sh_degree != assembly.recipe.first_frame.sh_degree:
         raise InputError(
             f"the first frame has spherical harmonics of degree {first.gaussians.sh_degree}, the recipe asks for "
-            f"{parts.recipe.first_frame.sh_degree}; set first_frame.sh_degree={first.gaussians.sh_degree}"
+            f"{assembly.recipe.first_frame.sh_degree}; set first_frame.sh_degree={first.gaussians.sh_degree}"
         )
     # A delta may have put Gaussians between the positions that a key packet can say. They are grouped as players will
     # have them, or a resumed run would find other groups.
     with tools.log.phase("code"):
         decoded = replace(first, scene=replace(first.scene, gaussians=quantise_key(first.gaussians)))
         gaussians = decoded.gaussians.map(torch.from_numpy)
-        anchors = reused_anchors(parts, decoded, frame)
-        hierarchy, levels, gaussians = sort_into_nodes(parts, gaussians, anchors.levels, anchors)
+        anchors = reused_anchors(assembly, decoded, frame)
+        hierarchy, levels, gaussians = sort_into_nodes(assembly, gaussians, anchors.levels, anchors)
         layout = make_layout(hierarchy, levels, anchors)
         exposure = exposure_from_meta(first.meta)
-        first_seen = first_layer_mask(parts, gaussians, frame, exposure, rng)
+        first_seen = first_layer_mask(assembly, gaussians, frame, exposure, rng)
         meta = key_meta(meta, exposure, anchors.origin)
-        state, packet = key_state(parts, gaussians, layout, hierarchy, frame, meta, rng, first_seen)
+        state, packet = key_state(assembly, gaussians, layout, hierarchy, frame, meta, rng, first_seen)
     tools.log.set(iterations=0)
     return Step(state, packet, "key")
 
@@ -74,7 +74,7 @@ def _check_views(theirs: StreamMeta, cameras: Cameras, held_out: tuple[str, ...]
         )
 
 
-def reused_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors:
+def reused_anchors(assembly: Assembly, first: PlayerState, frame: Frame) -> Anchors:
     """Return the grid on which a frame 0 of another stream goes on.
 
     It is that stream's own, bit for bit, if a structure of the same settings laid it, or if this method's structure
@@ -82,20 +82,20 @@ def reused_anchors(parts: Assembly, first: PlayerState, frame: Frame) -> Anchors
     structure lays around the decoded centres, and each Gaussian gets the level of the nearest cell size.
     """
     theirs = decoded_anchors(first)
-    if can_reuse_grid(parts, first.meta.recipe):
+    if can_reuse_grid(assembly, first.meta.recipe):
         return theirs
-    grid = parts.structure.seed(point_cloud_of(first), frame.cameras)
+    grid = assembly.structure.seed(point_cloud_of(first), frame.cameras)
     sizes = theirs.cell_sizes[theirs.levels]
     levels = (sizes.log()[:, None] - grid.cell_sizes.log()[None]).abs().argmin(1)
     return replace(theirs, levels=levels, cell_sizes=grid.cell_sizes, origin=grid.origin)
 
 
-def can_reuse_grid(parts: Assembly, recipe: Mapping[str, Any]) -> bool:
+def can_reuse_grid(assembly: Assembly, recipe: Mapping[str, Any]) -> bool:
     """Return whether the grid of a stream serves this method's structure as it is."""
-    if not parts.structure.claims().has_grid:
+    if not assembly.structure.claims().has_grid:
         return True
-    mine, theirs = parts.recipe.structure, recipe.get("structure", {})
-    grouping = parts.structure.grouping_settings
+    mine, theirs = assembly.recipe.structure, recipe.get("structure", {})
+    grouping = assembly.structure.grouping_settings
 
     def laying(params: Mapping[str, Any]) -> dict[str, Any]:
         return {key: value for key, value in params.items() if key not in grouping}

@@ -26,12 +26,12 @@ from gsstream.packet import StreamMeta, quantise_key
 REFINED = "refined"
 
 
-def key_packet_if_due(parts: Assembly, step: Step, frame: Frame, tools: Tools) -> Step:
+def key_packet_if_due(assembly: Assembly, step: Step, frame: Frame, tools: Tools) -> Step:
     """Return ``step``, or when a key packet is due at this frame, the step that writes one instead.
 
     A key packet that the budget refuses, or whose frame is skipped, stays due: the next frame tries again.
     """
-    reason, state = _due(parts, step), step.state
+    reason, state = _due(assembly, step), step.state
     if reason is None:
         return step
     # A skipped frame stays an empty packet: it must not fail, and a key packet would take the time that skipping saves.
@@ -41,7 +41,7 @@ def key_packet_if_due(parts: Assembly, step: Step, frame: Frame, tools: Tools) -
     # A refined scene was fitted to the pictures of this frame; another may show older ones.
     made, shown = (refined_key_step, frame) if reason == REFINED else (reencode_as_key, state.previous)
     with tools.log.phase("key"):
-        after = made(parts, state, frame, tools.meta(frame), tools.rng)
+        after = made(assembly, state, frame, tools.meta(frame), tools.rng)
     max_bytes = None if tools.budget is None else tools.budget.max_bytes
     if max_bytes is not None and len(after.packet.data) > max_bytes:
         return _postponed(step, reason, f"{len(after.packet.data)} bytes where {max_bytes} are allowed", tools)
@@ -49,16 +49,16 @@ def key_packet_if_due(parts: Assembly, step: Step, frame: Frame, tools: Tools) -
     return Step(replace(after.state, previous=shown), after.packet, "key")
 
 
-def _due(parts: Assembly, step: Step) -> str | None:
+def _due(assembly: Assembly, step: Step) -> str | None:
     """Why the frame is to become a key packet; None: it is not.
 
     It is not asked of frames whose iterations of a refinement follow their packets (``engine.method.parts``).
     """
-    every, state = parts.recipe.codec.key_interval, step.state
+    every, state = assembly.recipe.codec.key_interval, step.state
     if step.status == "key":
         return None
     if state.refinement is not None:  # a periodic one would end the refinement: it waits for the refined one
-        return REFINED if is_refined(parts.recipe.stream, state.refinement) else None
+        return REFINED if is_refined(assembly.recipe.stream, state.refinement) else None
     return "period" if every and state.player.frame - state.key_frame >= every else None
 
 
@@ -67,36 +67,44 @@ def _postponed(step: Step, reason: str, refused: str, tools: Tools) -> Step:
     return step
 
 
-def refined_key_step(parts: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
+def refined_key_step(assembly: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
     """Return the refined first frame, as it is now, as a key packet, and the state that follows from its bytes."""
     found = state.refinement
     assert found is not None
-    cheaper = rd_quantise(parts, found.gaussians, frame, state.exposure, rng)
+    cheaper = rd_quantise(assembly, found.gaussians, frame, state.exposure, rng)
     gaussians = quantise_key(cheaper.map(lambda t: t.numpy())).map(torch.from_numpy)
-    return _key_step(parts, state, gaussians, found.levels, frame, frame.index, meta, rng, layered=True)
+    return _key_step(assembly, state, gaussians, found.levels, frame, frame.index, meta, rng, layered=True)
 
 
-def reencode_as_key(parts: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
+def reencode_as_key(assembly: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
     """Return the current decoded scene as a key packet, and the state that follows from its bytes."""
     gaussians = quantise_key(state.player.gaussians).map(torch.from_numpy)
     levels = decoded_anchors(state.player).levels
-    return _key_step(parts, state, gaussians, levels, frame, state.previous.index, meta, rng)
+    return _key_step(assembly, state, gaussians, levels, frame, state.previous.index, meta, rng)
 
 
 def _key_step(
-    parts: Assembly, state: StreamState, gaussians: Gaussians[torch.Tensor], levels: torch.Tensor, frame: Frame,
-    shown: int, meta: StreamMeta, rng: Rng, *, layered: bool = False,
-) -> Step:  # fmt: skip
+    assembly: Assembly,
+    state: StreamState,
+    gaussians: Gaussians[torch.Tensor],
+    levels: torch.Tensor,
+    frame: Frame,
+    shown: int,
+    meta: StreamMeta,
+    rng: Rng,
+    *,
+    layered: bool = False,
+) -> Step:
     """A key packet of Gaussians on its grids, of these levels, which show the pictures of the frame ``shown``.
 
     A periodic one has no layers: a player that continues needs none, and to find them would cost the frame time.
     """
     anchors = decoded_anchors(state.player)
-    hierarchy, levels, gaussians = sort_into_nodes(parts, gaussians, levels, anchors)
+    hierarchy, levels, gaussians = sort_into_nodes(assembly, gaussians, levels, anchors)
     layout = make_layout(hierarchy, levels, anchors)
     # A resumed run must compare the next frame with the picture this scene shows, which may be an older one.
     meta = replace(meta, extra={**meta.extra, SHOWN: shown})
-    first = first_layer_mask(parts, gaussians, frame, state.exposure, rng) if layered else None
+    first = first_layer_mask(assembly, gaussians, frame, state.exposure, rng) if layered else None
     meta = key_meta(meta, state.exposure, anchors.origin)
-    after, packet = key_state(parts, gaussians, layout, hierarchy, frame, meta, rng, first)
+    after, packet = key_state(assembly, gaussians, layout, hierarchy, frame, meta, rng, first)
     return Step(after, packet, "key")

@@ -70,7 +70,7 @@ def _decoded_states(path: Path, last: int | None) -> Iterator[tuple[PlayerState,
             yield player, entry.kind
 
 
-def check_stream(parts: Assembly, path: Path, info: SourceInfo) -> bool:
+def check_stream(assembly: Assembly, path: Path, info: SourceInfo) -> bool:
     """Say whether a stream has a complete frame 0. Raises OutputError for another recipe or recording than its own."""
     if path.stat().st_size < FILE_HEADER.size:
         return False
@@ -78,26 +78,26 @@ def check_stream(parts: Assembly, path: Path, info: SourceInfo) -> bool:
         if not reader.frames or reader.frames[0].kind != PacketKind.KEY:
             return False
         meta = decode_packet(None, reader.read(reader.frames[0])).meta
-    _check_recipe(parts, meta)
+    _check_recipe(assembly, meta)
     _check_recording(info, meta)
     return True
 
 
-def state_after(parts: Assembly, states: Iterable[PlayerState], rng: Rng) -> StreamState:
+def state_after(assembly: Assembly, states: Iterable[PlayerState], rng: Rng) -> StreamState:
     """Return the state after these player states, the first that of a key packet; ``previous`` is not set."""
     state: StreamState | None = None
     for player in states:
         if state is None:
-            state = key_state_from_player(parts, player, rng)
+            state = key_state_from_player(assembly, player, rng)
         else:
-            state = next_state(parts.motion, state, player, rng)
+            state = next_state(assembly.motion, state, player, rng)
     assert state is not None, "a stream without a key packet"
     return state
 
 
-def refinement_after(parts: Assembly, state: StreamState, tools: Tools) -> Refinement | None:
+def refinement_after(assembly: Assembly, state: StreamState, tools: Tools) -> Refinement | None:
     """Return the refinement of frame 0 at the end of the stream, recomputed from packets and images since its key."""
-    stream = parts.recipe.stream
+    stream = assembly.recipe.stream
     if not is_refining(stream, state) or state.player.frame == state.key_frame:
         return None
     found: Refinement | None = None
@@ -107,18 +107,18 @@ def refinement_after(parts: Assembly, state: StreamState, tools: Tools) -> Refin
             found = start_refinement(player)
         else:
             frame = tools.recorded(player.frame)
-            found = advance_refinement(parts, found, before, player, frame, state.exposure, tools.rng)
+            found = advance_refinement(assembly, found, before, player, frame, state.exposure, tools.rng)
         before = player
     return found
 
 
-def key_state_from_player(parts: Assembly, player: PlayerState, rng: Rng) -> StreamState:
+def key_state_from_player(assembly: Assembly, player: PlayerState, rng: Rng) -> StreamState:
     """Return the encoder state right after a key packet, from the decoded packet alone (``previous`` is not set)."""
     gaussians = player.gaussians.map(torch.from_numpy)
-    decoders = parts.update.init_decoders(gaussians, rng.stream("decoders", player.frame))
+    decoders = assembly.update.init_decoders(gaussians, rng.stream("decoders", player.frame))
     return StreamState(
         player=player,
-        hierarchy=rebuild_hierarchy(parts, player),
+        hierarchy=rebuild_hierarchy(assembly, player),
         previous=None,  # type: ignore[arg-type]
         decoders=decoders,
         exposure=exposure_from_meta(player.meta),
@@ -126,13 +126,13 @@ def key_state_from_player(parts: Assembly, player: PlayerState, rng: Rng) -> Str
     )
 
 
-def rebuild_hierarchy(parts: Assembly, player: PlayerState) -> Hierarchy:
+def rebuild_hierarchy(assembly: Assembly, player: PlayerState) -> Hierarchy:
     """Return the hierarchy that the encoder built: the structure sees the same bits, so it gives the same forest."""
-    return parts.structure.build(player.gaussians.map(torch.from_numpy), decoded_anchors(player))
+    return assembly.structure.build(player.gaussians.map(torch.from_numpy), decoded_anchors(player))
 
 
-def _check_recipe(parts: Assembly, meta: StreamMeta) -> None:
-    old, new = dict(meta.recipe), parts.recipe.model_dump(mode="json")
+def _check_recipe(assembly: Assembly, meta: StreamMeta) -> None:
+    old, new = dict(meta.recipe), assembly.recipe.model_dump(mode="json")
     changed = sorted(
         key for key in new if key != "frames" and _deciding_keys(key, old.get(key)) != _deciding_keys(key, new[key])
     )

@@ -32,14 +32,14 @@ class Checked(StreamingMethod[Any]):
 
     source = "gsstream"
     _method: StreamingMethod[Any]
-    _parts: Assembly
+    _assembly: Assembly
 
-    def __init__(self, method: StreamingMethod[Any], parts: Assembly) -> None:
+    def __init__(self, method: StreamingMethod[Any], assembly: Assembly) -> None:
         super().__init__()
-        vars(self).update(_method=method, _parts=parts)
+        vars(self).update(_method=method, _assembly=assembly)
 
     def begin(self, frame: Frame, tools: Tools) -> Step[Any]:
-        recipe, method = self._parts.recipe, self._method
+        recipe, method = self._assembly.recipe, self._method
         name = recipe.streaming_method.name if recipe.streaming_method.name != "parts" else recipe.method
         check_cameras(frame.cameras, method.min_cameras, f"the method {name!r}")
         with self._blaming(frame):
@@ -71,7 +71,7 @@ class Checked(StreamingMethod[Any]):
         return found
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> Any:
-        with error_context(SLOT, self._method, self._parts.where):
+        with error_context(SLOT, self._method, self._assembly.where):
             return self._method.resume(player, self._given(shown), tools)
 
     def _given(self, frame: Frame) -> Frame:
@@ -79,15 +79,15 @@ class Checked(StreamingMethod[Any]):
         return frame if isinstance(self._method, PartsMethod) else frame.as_float32()
 
     def _blaming(self, frame: Frame) -> Any:
-        self._parts.where.enter(frame.index)
-        return error_context(SLOT, self._method, self._parts.where)
+        self._assembly.where.enter(frame.index)
+        return error_context(SLOT, self._method, self._assembly.where)
 
     def _fault(self, message: str) -> ComponentError:
-        return fault(message, SLOT, self._method, self._parts.where)
+        return fault(message, SLOT, self._method, self._assembly.where)
 
     def _compared(self, before: PlayerState | None, step: Step[Any], frame: Frame, tools: Tools) -> Step[Any]:
         """Compare a step with what players make of its packet, and log the numbers that follow from it."""
-        self._parts.where.enter(frame.index)
+        self._assembly.where.enter(frame.index)
         kind = step.packet.kind.name.lower()
         if step.packet.frame != frame.index or kind != step.status:
             raise self._fault(
@@ -98,7 +98,7 @@ class Checked(StreamingMethod[Any]):
             raise self._fault(f"its step has metrics ({', '.join(step.metrics)}): write numbers to tools.log.set(...)")
         player: PlayerState = step.state.player
         # A packet that was decoded when it was made carries what it was decoded to.
-        if step.packet.decoded is not player or self._parts.checks is Checks.STEP:
+        if step.packet.decoded is not player or self._assembly.checks is Checks.STEP:
             player = decode_packet(before, step.packet.data)
             difference = difference_between(player, step.state.player)
             if difference:
@@ -134,8 +134,9 @@ def difference_between(player: PlayerState, claimed: PlayerState) -> str:
 def _history_difference(player: PlayerState, claimed: PlayerState) -> str:
     """Describe what differs in what later motions are predicted from; empty when nothing does."""
     memory = {
-        "displacement": ("rows", "translation", "rotation"), "groups": ("cell", "brightness_bins", "count", "group_of"),
-    }  # fmt: skip
+        "displacement": ("rows", "translation", "rotation"),
+        "groups": ("cell", "brightness_bins", "count", "group_of"),
+    }
     for name, fields in memory.items():
         want, got = getattr(player.scene, name), getattr(claimed.scene, name)
         if want is None and got is None:

@@ -52,9 +52,7 @@ class Repeating(StreamingMethod[Any]):
             step = self._method.step(state, replace(frame, epoch_scale=0.0), tools)
             if step.status != "empty":
                 raise
-            warnings.warn(
-                f"frame {frame.index} repeats the one before it: {error}", RepeatedFrameWarning, stacklevel=2
-            )
+            warnings.warn(f"frame {frame.index} repeats the one before it: {error}", RepeatedFrameWarning, stacklevel=2)
             return step
 
     def follow_up(self, state: Any, step: Step[Any], frame: Frame, tools: Tools) -> Step[Any]:
@@ -66,8 +64,10 @@ class Repeating(StreamingMethod[Any]):
             found = self._method.follow_up(state, step, replace(frame, epoch_scale=0.0), tools)
             warnings.warn(
                 f"frame {frame.index}: its packet is sound, but the work that follows it failed and is left out: "
-                f"{error}", SkippedWorkWarning, stacklevel=2
-            )  # fmt: skip
+                f"{error}",
+                SkippedWorkWarning,
+                stacklevel=2,
+            )
             return found
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> Any:
@@ -112,11 +112,11 @@ class Budgeted(StreamingMethod[Any]):
         return self._method.resume(player, shown, tools)
 
 
-def wrapped(parts: Assembly, controller: Controller) -> StreamingMethod[Any]:
+def wrapped(assembly: Assembly, controller: Controller) -> StreamingMethod[Any]:
     """Return the method of a recipe behind what its recipe asks for; each wrapper is a method itself."""
-    own = parts.part("streaming_method")
-    method: StreamingMethod[Any] = own.with_slots(parts) if isinstance(own, PartsMethod) else own  # type: ignore[assignment]
-    method = Checked(method, parts)
+    own = assembly.part("streaming_method")
+    method: StreamingMethod[Any] = own.with_slots(assembly) if isinstance(own, PartsMethod) else own  # type: ignore[assignment]
+    method = Checked(method, assembly)
     if controller.budget.limits_anything:
         method = Budgeted(method, controller)
-    return Repeating(method) if parts.recipe.stream.on_error == "repeat" else method
+    return Repeating(method) if assembly.recipe.stream.on_error == "repeat" else method

@@ -61,7 +61,7 @@ class Encoder:
     ``callbacks.packet`` gets a packet as soon as it is made; some methods work on after it in the same call.
 
     Arguments:
-        parts: the live parts of a recipe (``engine.assembly.assemble``).
+        assembly: the live parts of a recipe (``engine.assembly.assemble``).
         info: cameras, frames per second and names of the recording.
         seeds: function that makes the points frame 0 starts from; None: a plane sweep over its training images.
         first_frame: frame 0 of another stream, used instead of a reconstruction.
@@ -70,29 +70,35 @@ class Encoder:
     """
 
     def __init__(
-        self, parts: Assembly, info: SourceInfo, seeds: Seeds | None = None, *, first_frame: PlayerState | None = None,
-        callbacks: Callbacks | None = None, transform_cameras: bool = False,
-    ) -> None:  # fmt: skip
-        held = sized(parts.recipe.budget, info.fps)
-        self.controller = Controller(held, parts.recipe.stream)
-        self.parts = replace(parts, recipe=parts.recipe.model_copy(update={"budget": held}))
+        self,
+        assembly: Assembly,
+        info: SourceInfo,
+        seeds: Seeds | None = None,
+        *,
+        first_frame: PlayerState | None = None,
+        callbacks: Callbacks | None = None,
+        transform_cameras: bool = False,
+    ) -> None:
+        held = sized(assembly.recipe.budget, info.fps)
+        self.controller = Controller(held, assembly.recipe.stream)
+        self.assembly = replace(assembly, recipe=assembly.recipe.model_copy(update={"budget": held}))
         self.info, self._transform_cameras = info, transform_cameras
-        self.rng = Rng(parts.recipe.seed)
-        self.near_plane = parts.recipe.near * info.train.extent
+        self.rng = Rng(assembly.recipe.seed)
+        self.near_plane = assembly.recipe.near * info.train.extent
         #: State after the last frame; None before frame 0.
         self.state: Any = None
         self._first = None if first_frame is None else to_stream_coordinates(first_frame, info.world)
         self._seeds, self._listeners = seeds or self._swept, callbacks or Callbacks()
 
     @property
-    def parts(self) -> Assembly:
+    def assembly(self) -> Assembly:
         """The live parts; setting them makes the method anew."""
-        return self._parts
+        return self._assembly
 
-    @parts.setter
-    def parts(self, parts: Assembly) -> None:
-        self._parts = parts
-        self.method = wrapped(parts, self.controller)
+    @assembly.setter
+    def assembly(self, assembly: Assembly) -> None:
+        self._assembly = assembly
+        self.method = wrapped(assembly, self.controller)
 
     def encode(self, frame: Frame) -> Step[Any]:
         """Encode the next frame: the first as a key packet, later ones as the method decides.
@@ -111,8 +117,8 @@ class Encoder:
         if self.state is not None and frame.index != self.state.player.frame + 1:
             expected = self.state.player.frame + 1
             raise InputError(f"frame {frame.index}: expected frame {expected}, frames are encoded in order")
-        if self.parts.background != (background := self._background(frame)):
-            self.parts = replace(self.parts, background=background)
+        if self.assembly.background != (background := self._background(frame)):
+            self.assembly = replace(self.assembly, background=background)
         frame, method = self.with_near_plane(frame), self.method
         log, worked = FrameLog(), time.process_time()
         tools = self._tools(log=log)
@@ -142,16 +148,16 @@ class Encoder:
         Raises OutputError when the recipe or the recording is not the one the stream was written with.
         """
         # Checked before the replay, which with the parts of another recipe would fail with a less helpful message.
-        if not check_stream(self.parts, stream, self.info) or (last is not None and last < 0):
+        if not check_stream(self.assembly, stream, self.info) or (last is not None and last < 0):
             return None
         end = read_end(stream, last)
         # The title is what the stream says: equal recipes may be called otherwise by another version.
         meta = end.player.meta
-        self.parts = replace(self.parts, title=meta.title, background=meta.background)
+        self.assembly = replace(self.assembly, title=meta.title, background=meta.background)
         tools = self._tools(
             replay=lambda: states_since_key(stream, end), recorded=lambda index: self.with_near_plane(image(index))
         )
-        self.parts.where.enter(end.player.frame)
+        self.assembly.where.enter(end.player.frame)
         with one_torch_thread():
             shown = self.with_near_plane(image(end.shown))
             shown = replace(shown, images=packed(shown.images))
@@ -167,7 +173,12 @@ class Encoder:
 
     def _tools(self, **changes: Any) -> RunTools:
         return RunTools(
-            self.parts, self.rng, self._meta, self._points, first=self._first, progress=self._listeners.progress,
+            self.assembly,
+            self.rng,
+            self._meta,
+            self._points,
+            first=self._first,
+            progress=self._listeners.progress,
             **changes,
         )
 
@@ -181,15 +192,15 @@ class Encoder:
             return cast("tuple[float, float, float]", self.state.player.meta.background)
         if self._first is not None:
             return self._first.meta.background
-        wanted = self.parts.recipe.background
+        wanted = self.assembly.recipe.background
         return mean_color(frame.as_float32().images) if wanted == "auto" else wanted
 
     def _swept(self, frame: Frame) -> PointCloud:
-        return gather_points(None, frame, self.parts.recipe.first_frame)
+        return gather_points(None, frame, self.assembly.recipe.first_frame)
 
     def _meta(self, frame: Frame) -> StreamMeta:
-        info, recipe = self.info, self.parts.recipe
-        distributions = {"gsstream", *self.parts.distributions}
+        info, recipe = self.info, self.assembly.recipe
+        distributions = {"gsstream", *self.assembly.distributions}
         known = {} if self.state is None else self.state.player.meta.extra
         carried = {name: known[name] for name in CARRIED if name in known}
         return StreamMeta(
@@ -199,9 +210,9 @@ class Encoder:
             train=frame.cameras,
             test=replace(info.test, near_plane=self.near_plane),
             fps=info.fps,
-            background=self.parts.background,
+            background=self.assembly.background,
             plugins={name: version(name) for name in sorted(distributions)},
-            extra={"source_uri": info.uri, "licence": info.licence, "title": self.parts.title, **carried},
+            extra={"source_uri": info.uri, "licence": info.licence, "title": self.assembly.title, **carried},
             world=info.world,
         )
 

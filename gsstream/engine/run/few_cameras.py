@@ -41,12 +41,12 @@ def expectation(cameras: Cameras) -> str:
     )
 
 
-def first_frame_summary(parts: Assembly, cameras: Cameras, seeds: str) -> str:
+def first_frame_summary(assembly: Assembly, cameras: Cameras, seeds: str) -> str:
     """Return one line on what frame 0 was made with, and why: ``seeds`` names where its points came from."""
-    settings = parts.recipe.first_frame
+    settings = assembly.recipe.first_frame
     chosen, number = choose_regularisers(settings, cameras), len(cameras)
-    colour = ", ".join(f"{value:.2f}" for value in parts.background)
-    why = "the mean of its images" if parts.recipe.background == "auto" else "as the recipe says"
+    colour = ", ".join(f"{value:.2f}" for value in assembly.background)
+    why = "the mean of its images" if assembly.recipe.background == "auto" else "as the recipe says"
     said = [f"seeds: {seeds}", f"background ({colour}), {why}"]
     if settings.shell:
         said.append(f"{SEEDS} large seeds behind the scene")

@@ -10,12 +10,17 @@ from gsstream.core.frame import Frame
 
 #: What the summary, and what a frame's line, says of each policy.
 COUNTED: Mapping[str, str] = {
-    "dropped": "{} dropped because the run was behind", "missing": "{} dropped because a camera's image did not come",
-    "hurried": "{} hurried", "held": "{} with held images",
-}  # fmt: skip
+    "dropped": "{} dropped because the run was behind",
+    "missing": "{} dropped because a camera's image did not come",
+    "hurried": "{} hurried",
+    "held": "{} with held images",
+}
 _WORDS: Mapping[str, str] = {
-    "dropped": "dropped", "missing": "dropped: a camera is missing", "hurried": "hurried", "held": "an image is held",
-}  # fmt: skip
+    "dropped": "dropped",
+    "missing": "dropped: a camera is missing",
+    "hurried": "hurried",
+    "held": "an image is held",
+}
 
 
 def live_metrics(frame: Frame, written: float) -> dict[str, Any] | None:
@@ -29,9 +34,11 @@ def live_metrics(frame: Frame, written: float) -> dict[str, Any] | None:
         return None
     latency = None if arrival.complete is None else written - arrival.complete
     return {
-        "latency_seconds": latency, "policy": _policy(frame), "epoch_scale": frame.epoch_scale,
+        "latency_seconds": latency,
+        "policy": _policy(frame),
+        "epoch_scale": frame.epoch_scale,
         "absent": list(arrival.absent),
-    }  # fmt: skip
+    }
 
 
 def _policy(frame: Frame) -> str | None:

@@ -121,10 +121,14 @@ def disk_errors(out: Path) -> Iterator[None]:
         yield
     except OSError as error:
         advice = {
-            errno.ENOSPC: "make room", errno.EDQUOT: "make room", errno.EROFS: "make the disk writable",
-            errno.EFBIG: "make room", errno.EIO: "check the disk",
-            errno.EACCES: "make the folder writable", errno.ENOENT: "do not move or delete the folder of a run",
-        }.get(error.errno or 0)  # fmt: skip
+            errno.ENOSPC: "make room",
+            errno.EDQUOT: "make room",
+            errno.EROFS: "make the disk writable",
+            errno.EFBIG: "make room",
+            errno.EIO: "check the disk",
+            errno.EACCES: "make the folder writable",
+            errno.ENOENT: "do not move or delete the folder of a run",
+        }.get(error.errno or 0)
         if advice is None:
             raise
         where = error.filename or out

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from gsstream.core.signs import Signs, duration
+from gsstream.core.progress import ProgressDisplay, duration
 from gsstream.engine.budget.report import violations
 from gsstream.engine.run.live import latency_words
 
@@ -17,12 +17,10 @@ _SURE = 10
 _LONG = 3600
 
 
-class RunProgress(Signs):
+class RunProgress(ProgressDisplay):
     """Frame 0 as a bar over iterations, later frames as a bar over frames with PSNR, KB, seconds and active share."""
 
-    def __init__(
-        self, total_frames: int | None, quiet: bool, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, total_frames: int | None, quiet: bool, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__(quiet, clock)
         self._frames = total_frames
         self._announced = False
@@ -52,8 +50,9 @@ class RunProgress(Signs):
             warnings.warn(
                 f"frame 0 takes about {duration(left)} more at this pace ({iteration} of {iterations} iterations are "
                 "done). Smaller pictures (--scale) and fewer iterations (--set first_frame.max_iterations=N) make it "
-                "shorter", stacklevel=2
-            )  # fmt: skip
+                "shorter",
+                stacklevel=2,
+            )
 
     def frame(self, metrics: Mapping[str, Any]) -> None:
         """Show a frame that was written."""

@@ -10,13 +10,13 @@ from typing import Any
 from pydantic import ValidationError
 
 from gsstream.core.errors import GsstreamError, PacketError, PluginUnavailable, RecipeError
+from gsstream.discovery.catalog import Catalog
 from gsstream.input.recordings.base import FrameSource
 from gsstream.input.recordings.canonical import CanonicalSource, recording_similarity
 from gsstream.input.recordings.open import open_source
 from gsstream.input.recordings.options import DataOptions
 from gsstream.input.recordings.transformed import transformed
 from gsstream.packet import PlayerState, StreamReader, decode_packet
-from gsstream.plugins.catalog import Catalog
 from gsstream.recipe.model import Recipe
 
 

@@ -55,7 +55,7 @@ class RunResult:
 
 
 def run(
-    parts: Assembly,
+    assembly: Assembly,
     source: FrameSource,
     out: Path,
     *,
@@ -68,7 +68,7 @@ def run(
     """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml).
 
     Arguments:
-        parts: the live parts of the recipe.
+        assembly: the live parts of the recipe.
         source: an open recording at the recipe's scale; the caller closes it.
         out: a prepared output folder.
         resume: continue the run that ``out`` holds; the recipe must be the same.
@@ -77,7 +77,7 @@ def run(
         first_frame: frame 0 of another stream, taken over instead of being reconstructed.
         listener: called before and after every frame.
     """
-    state = _Run(limit_memory(parts, source.info), source, out, quiet, measure, first_frame)
+    state = _Run(limit_memory(assembly, source.info), source, out, quiet, measure, first_frame)
     listener, done = listener or RunListener(), state.prepare(resume)
     indices = itertools.count(done) if state.total is None else range(done, state.total)
     with (
@@ -101,15 +101,20 @@ class _Run:
     """The moving parts of one run; lives only inside :func:`run`."""
 
     def __init__(
-        self, parts: Assembly, source: FrameSource, out: Path, quiet: bool, measure: bool,
+        self,
+        assembly: Assembly,
+        source: FrameSource,
+        out: Path,
+        quiet: bool,
+        measure: bool,
         first_frame: PlayerState | None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.source, self.out = source, out
-        self.total = _num_frames(source.info, parts.recipe.frames)
-        self.held_out = HeldOut(parts.renderer) if measure else None
+        self.total = _num_frames(source.info, assembly.recipe.frames)
+        self.held_out = HeldOut(assembly.renderer) if measure else None
         self.progress = RunProgress(self.total, quiet)
         listeners = Callbacks(packet=self._write, progress=self.progress.first_frame)
-        self.encoder = Encoder(parts, source.info, self._seeds, first_frame=first_frame, callbacks=listeners)
+        self.encoder = Encoder(assembly, source.info, self._seeds, first_frame=first_frame, callbacks=listeners)
         self.writer: StreamWriter
         #: Where the seeds of frame 0 came from; empty where it is taken over or was made before.
         self.seeded = ""
@@ -120,7 +125,7 @@ class _Run:
         """Go on after what the folder holds, or write the recipe into it; return the first frame to encode."""
         last = self._resume() if resume else None
         if last is None:
-            save_resolved(self.out / RECIPE, self.encoder.parts.resolved)
+            save_resolved(self.out / RECIPE, self.encoder.assembly.resolved)
             if sentence := expectation(self.source.info.train):
                 self.progress.say(sentence)
             return 0
@@ -142,7 +147,7 @@ class _Run:
         append_metrics(self.out / METRICS, metrics)
         self.progress.frame(metrics)
         if train.index == 0 and self.seeded:
-            self.progress.say(first_frame_summary(self.encoder.parts, train.cameras, self.seeded))
+            self.progress.say(first_frame_summary(self.encoder.assembly, train.cameras, self.seeded))
 
     def _write(self, packet: EncodedPacket) -> None:
         self.writer.append(packet)
@@ -150,7 +155,7 @@ class _Run:
         self.written = time.time()
 
     def _seeds(self, frame: Frame) -> PointCloud:
-        recipe = self.encoder.parts.recipe
+        recipe = self.encoder.assembly.recipe
         seen = with_test_views(self.source, frame) if recipe.data.leak == "points" else frame
         points = gather_points(self.source, seen, recipe.first_frame, self.progress.tell)
         self.seeded = points.origin
@@ -188,8 +193,9 @@ def _warn_lost_lines(stream: Path, last: int) -> None:
         frames = f"frame {held[0]}" if len(held) == 1 else f"frames {held[0]} to {held[-1]}"
         warnings.warn(
             f"{METRICS} has no line of frame {held[0]}, though {stream.name} has its packet: {frames} of the stream "
-            f"{'is' if len(held) == 1 else 'are'} made again", stacklevel=2
-        )  # fmt: skip
+            f"{'is' if len(held) == 1 else 'are'} made again",
+            stacklevel=2,
+        )
 
 
 def _num_frames(info: SourceInfo, wanted: int | None) -> int | None:

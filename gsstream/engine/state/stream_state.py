@@ -48,9 +48,7 @@ class Resident(NamedTuple):
     images: FrameImages
 
 
-def updated(
-    before: Gaussians[torch.Tensor], after: Gaussians[FloatArray], rows: IntArray
-) -> Gaussians[torch.Tensor]:
+def updated(before: Gaussians[torch.Tensor], after: Gaussians[FloatArray], rows: IntArray) -> Gaussians[torch.Tensor]:
     """Return the scene ``after`` on the device of ``before``; only ``rows`` [A], all that differ, are copied to it."""
     device = before.means.device
     if device.type == "cpu":

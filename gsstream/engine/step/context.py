@@ -15,9 +15,9 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.log import FrameLog
 from gsstream.core.picture_size import is_large
 from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.fit.constants import DSSIM
 from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.engine.fit.photometric import PhotometricLoss, render_exposed
-from gsstream.engine.fit.schedule import DSSIM
 from gsstream.engine.state.stream_state import Resident, StreamState
 from gsstream.engine.step.active.candidates import VoteCache, changed_rows
 from gsstream.engine.step.active.change import MAX_PIXEL_SIGMA, Change
@@ -37,10 +37,16 @@ class EngineContext:
     """
 
     def __init__(
-        self, parts: Assembly, state: StreamState, frame: Frame, log: FrameLog, change: Change | None = None,
-        part_scale: float = 1.0, images: FrameImages | None = None,
-    ) -> None:  # fmt: skip
-        self._parts, device, resident = parts, parts.renderer.device, state.resident
+        self,
+        assembly: Assembly,
+        state: StreamState,
+        frame: Frame,
+        log: FrameLog,
+        change: Change | None = None,
+        part_scale: float = 1.0,
+        images: FrameImages | None = None,
+    ) -> None:
+        self._assembly, device, resident = assembly, assembly.renderer.device, state.resident
         if resident is None:
             gaussians = state.gaussians.map(lambda value: value.to(device))
             resident = Resident(gaussians, state.hierarchy.to(device), FrameImages(state.previous.images, device))
@@ -48,11 +54,11 @@ class EngineContext:
         self._frame, self._previous, self._device = frame, state.previous, device
         self._change = None if change is None else change.to(device)
         self._static = [] if change is None else (~change.tiles.flatten(1).any(1)).tolist()
-        self._background, self._part_scale = parts.background, part_scale
+        self._background, self._part_scale = assembly.background, part_scale
         self.log, self.key_rows = log, state.player.key_rows
         exposure = None if state.exposure is None else state.exposure.to(device)
         self.images = FrameImages(frame.images, device) if images is None else images
-        self.photometric = PhotometricLoss(parts.loss, DSSIM, self.images, exposure)
+        self.photometric = PhotometricLoss(assembly.loss, DSSIM, self.images, exposure)
         self._session = state.session
         self._votes = None if change is None else VoteCache(change, frame.cameras)
 
@@ -60,13 +66,13 @@ class EngineContext:
     def session(self) -> RenderSession:
         """The render session of this scene: what the last frame or a part made it project is not done again."""
         if self._session is None:
-            self._session = self._parts.renderer.open(self._gaussians, None, self.cameras, self._background)
+            self._session = self._assembly.renderer.open(self._gaussians, None, self.cameras, self._background)
         return self._session
 
     def session_for(self, rows: torch.Tensor) -> RenderSession:
         """Return the session in which only ``rows`` change; a new one when all do, since no cache is of use then."""
         if len(rows) == len(self._gaussians):
-            return self._parts.renderer.open(self._gaussians, None, self.cameras, self._background)
+            return self._assembly.renderer.open(self._gaussians, None, self.cameras, self._background)
         self.session.narrow(rows)
         return self.session
 
@@ -101,7 +107,7 @@ class EngineContext:
         return self.shown(self._gaussians, view)
 
     def shown(self, gaussians: Gaussians[torch.Tensor], view: int) -> torch.Tensor:
-        renderer, exposure = self._parts.renderer, self.photometric.exposure
+        renderer, exposure = self._assembly.renderer, self.photometric.exposure
         return render_exposed(renderer, gaussians, self.cameras, view, self._background, exposure)
 
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
@@ -136,14 +142,14 @@ class EngineContext:
 
     @property
     def optimiser(self) -> RowOptimiser:
-        return self._parts.optimiser
+        return self._assembly.optimiser
 
     def scaled(self, number: float) -> int:
         return max(1, round(number * self._frame.epoch_scale * self._part_scale))
 
     @property
     def shell_rows(self) -> torch.Tensor:
-        if not self._parts.recipe.first_frame.shell:
+        if not self._assembly.recipe.first_frame.shell:
             return torch.zeros_like(self._gaussians.opacities, dtype=torch.bool)
         means, scales = self._gaussians.means.cpu().numpy(), self._gaussians.scales.cpu().numpy()
         return torch.from_numpy(in_shell(means, scales, self.cameras)).to(self._device)
@@ -160,7 +166,7 @@ class EngineContext:
         return self.session.loss_and_grad(view, target, wrt)
 
     def view_target(self, view: int, tile_weights: torch.Tensor | None = None) -> ViewTarget:
-        self._parts.where.count()  # a target is asked for once in every iteration
+        self._assembly.where.count()  # a target is asked for once in every iteration
         return self.photometric.view_target(view, tile_weights)
 
     def changed_target(self, view: int) -> ViewTarget:

@@ -40,50 +40,59 @@ from gsstream.parts.render.base import RenderSession
 from gsstream.parts.update.base import Scope
 
 
-def frame_step(parts: Assembly, state: StreamState, frame: Frame, tools: Tools) -> Step:
+def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tools) -> Step:
     """Advance the stream by one frame. Pure: a failure leaves ``state`` as it was.
 
     Raises ComponentError when a part fails.
     """
-    log, rng, stream, scope = tools.log, tools.rng, parts.recipe.stream, parts.update.scope(frame.index)
-    parts.where.enter(frame.index)
+    log, rng, stream, scope = tools.log, tools.rng, assembly.recipe.stream, assembly.update.scope(frame.index)
+    assembly.where.enter(frame.index)
     if frame.epoch_scale == 0:  # a skipped frame: a source that is behind does not read its images
         return empty_step(state, frame, log)
     with log.phase("change"):
-        images = FrameImages(frame.images, parts.renderer.device)
+        images = FrameImages(frame.images, assembly.renderer.device)
         change = find_change(state, frame, images, stream.change_threshold)
     if change is not None and change.share == 0 and scope is not Scope.ALL:
         return empty_step(state, frame, log)
-    late = parts.checks is not Checks.STEP
+    late = assembly.checks is not Checks.STEP
     with log.phase("motion"), deferred_checks(late):
-        motions, scene, view = propose_motion(parts, state, frame, change, tools, images)
+        motions, scene, work = propose_motion(assembly, state, frame, change, tools, images)
     with log.phase("confidence"), deferred_checks(late):
-        rows, logits = select(parts, view, view.hierarchy, scope)
+        rows, logits = select(assembly, work, work.hierarchy, scope)
     with log.phase("optimise"):
         generator, views = rng.stream("frame", frame.index), len(frame.cameras)
-        target = (view.everywhere() if scope is Scope.ALL else view).residual_target
+        target = (work.everywhere() if scope is Scope.ALL else work).residual_target
         problem = Problem(
-            scene.layout, view.hierarchy, rows, view.gaussians.rows(rows), logits, state.decoders,
-            view.session_for(rows), target, views, frame.cameras.width * frame.cameras.height, generator,
+            scene.layout,
+            work.hierarchy,
+            rows,
+            work.gaussians.rows(rows),
+            logits,
+            state.decoders,
+            work.session_for(rows),
+            target,
+            views,
+            frame.cameras.width * frame.cameras.height,
+            generator,
             1.0 if tools.budget is None else tools.budget.step_scale,
-        )  # fmt: skip
+        )
         schedule = scheduled(stream, frame, tools.budget)
-        solution = optimise(parts, problem, schedule)
-        residual = quantise_residual(parts, problem, solution)
+        solution = optimise(assembly, problem, schedule)
+        residual = quantise_residual(assembly, problem, solution)
     with log.phase("growth"):
-        delta = with_growth(parts, state, Delta(motions).with_residual(residual), view, rng)
+        delta = with_growth(assembly, state, Delta(motions).with_residual(residual), work, rng)
     with log.phase("code"):
         most = None if tools.budget is None else tools.budget.max_bytes
-        fitted = encode_frame(delta, state.player, frame.index, solution, parts.recipe.codec.trim, most)
+        fitted = encode_frame(delta, state.player, frame.index, solution, assembly.recipe.codec.trim, most)
         player = decode_packet(state.player, fitted.packet.data)
     with log.phase("keep"):
         # A frame that changed nothing is not what the scene shows: the next one is compared with the last that did, so
         # that a change too slow to see from frame to frame adds up until it is seen.
         unchanged = fitted.delta.is_empty
         shown = state.previous if unchanged else replace(frame, images=packed(frame.images))
-        session, resident = keep(view, scene, fitted.delta, player)
+        session, resident = keep(work, scene, fitted.delta, player)
         kept = replace(state, previous=shown, session=session, resident=resident)
-        after = next_state(parts.motion, kept, player, rng)
+        after = next_state(assembly.motion, kept, player, rng)
     log_packet(log, player, fitted.packet)
     log.set(changed_tiles=1.0 if change is None else change.share, **step_numbers(solution, len(rows), session))
     if tools.budget is not None and (len(rows) or scope is Scope.NONE):
@@ -101,19 +110,19 @@ def empty_step(state: StreamState, frame: Frame, log: FrameLog) -> Step:
     return Step(replace(state, player=player), replace(packet, decoded=player), "empty")
 
 
-def with_growth(parts: Assembly, state: StreamState, delta: Delta, view: EngineContext, rng: Rng) -> Delta:
+def with_growth(assembly: Assembly, state: StreamState, delta: Delta, work: EngineContext, rng: Rng) -> Delta:
     """Return the delta with the rows that leave, of which those of the shell stay, and those that join.
 
     Raises ComponentError when the part fails, or proposes what does not fit the scene.
     """
-    if isinstance(parts.part("growth"), NoGrowth):
+    if isinstance(assembly.part("growth"), NoGrowth):
         return delta  # the scene after the residual is not needed
     after = apply_delta(state.player.scene, delta)
-    rows = parts.growth.propose(after, view, rng)
-    with error_context("growth", parts.part("growth"), parts.where):
+    rows = assembly.growth.propose(after, work, rng)
+    with error_context("growth", assembly.part("growth"), assembly.where):
         if rows is not None:
             apply_delta(after, Delta((rows,)))  # before rows are left out: a wrong proposal gets an error
-            rows = replace(rows, removed=rows.removed[~view.shell_rows.cpu().numpy()[rows.removed]])
+            rows = replace(rows, removed=rows.removed[~work.shell_rows.cpu().numpy()[rows.removed]])
     return delta.with_row_edit(rows)
 
 
@@ -124,17 +133,17 @@ class Selected(NamedTuple):
     logits: torch.Tensor
 
 
-def select(parts: Assembly, view: EngineContext, hierarchy: Hierarchy, scope: Scope) -> Selected:
+def select(assembly: Assembly, work: EngineContext, hierarchy: Hierarchy, scope: Scope) -> Selected:
     """Return what confidence, propagation and gate choose; none of them is called in a frame without a residual."""
     if scope is Scope.NONE:
-        nothing = view.gaussians.means.new_zeros(0, dtype=torch.int64)
-        return Selected(nothing, view.gaussians.means.new_zeros(hierarchy.num_nodes))
-    seen = view.everywhere() if scope is Scope.ALL else view
-    confidence = parts.propagation.propagate(parts.confidence.estimate(seen), hierarchy)
-    logits = parts.gate.init(confidence)
-    open_probability = parts.gate.open_probability(logits)
+        nothing = work.gaussians.means.new_zeros(0, dtype=torch.int64)
+        return Selected(nothing, work.gaussians.means.new_zeros(hierarchy.num_nodes))
+    seen = work.everywhere() if scope is Scope.ALL else work
+    confidence = assembly.propagation.propagate(assembly.confidence.estimate(seen), hierarchy)
+    logits = assembly.gate.init(confidence)
+    open_probability = assembly.gate.open_probability(logits)
     able = seen.changed_rows(CHANGE_VOTES)
-    return Selected(candidates(able, open_probability, hierarchy, parts.recipe.stream.active_threshold), logits)
+    return Selected(candidates(able, open_probability, hierarchy, assembly.recipe.stream.active_threshold), logits)
 
 
 #: Share of the rows that a frame may change where what the renderer keeps of the others pays.
@@ -142,22 +151,22 @@ MOST_CHANGED = 0.5
 
 
 def keep(
-    view: EngineContext, scene: Scene, delta: Delta, player: PlayerState
+    work: EngineContext, scene: Scene, delta: Delta, player: PlayerState
 ) -> tuple[RenderSession | None, Resident | None]:
     """Return what of a frame stays with the renderer, and on its device; nothing where :func:`commit_session` says so.
 
     Where the frame changed nothing, the images that the scene shows stay those of the frame before.
     """
-    found = commit_session(view, scene, delta, player)
+    found = commit_session(work, scene, delta, player)
     if found is None:
         return None, None
-    if view.images.device.type == "cpu":
+    if work.images.device.type == "cpu":
         return found[0], None
-    return found[0], Resident(found[1], view.hierarchy, view.previous_images if delta.is_empty else view.images)
+    return found[0], Resident(found[1], work.hierarchy, work.previous_images if delta.is_empty else work.images)
 
 
 def commit_session(
-    view: EngineContext, scene: Scene, delta: Delta, player: PlayerState
+    work: EngineContext, scene: Scene, delta: Delta, player: PlayerState
 ) -> tuple[RenderSession, Gaussians[torch.Tensor]] | None:
     """Return the session of the decoded scene, with what did not change still projected, and the scene itself.
 
@@ -170,5 +179,5 @@ def commit_session(
     rows = sent_rows(scene.layout, delta.gates(scene.layout))
     if len(rows) > MOST_CHANGED * len(player.gaussians):
         return None
-    gaussians = updated(view.gaussians, player.gaussians, rows)
-    return view.session.commit(gaussians, torch.from_numpy(rows).to(gaussians.means.device)), gaussians
+    gaussians = updated(work.gaussians, player.gaussians, rows)
+    return work.session.commit(gaussians, torch.from_numpy(rows).to(gaussians.means.device)), gaussians

@@ -61,7 +61,11 @@ def _counts(player: PlayerState, packet: EncodedPacket) -> dict[str, int]:
         gates = int((delta.gates(before) != 0).sum()) + added
         moving = sum(int(np.count_nonzero(motion.moving)) for motion in delta.motions)
     return {
-        "changed_gaussians": rows, "sent_gaussians": sent, "active_gates": gates,
-        "added_gaussians": added, "removed_gaussians": removed,
-        "moving_groups": moving, "displaced_gaussians": 0 if displacement is None else len(displacement.rows),
-    }  # fmt: skip
+        "changed_gaussians": rows,
+        "sent_gaussians": sent,
+        "active_gates": gates,
+        "added_gaussians": added,
+        "removed_gaussians": removed,
+        "moving_groups": moving,
+        "displaced_gaussians": 0 if displacement is None else len(displacement.rows),
+    }

@@ -30,39 +30,45 @@ class Moved(NamedTuple):
 
     motions: tuple[Motion | Field, ...]
     scene: Scene
-    view: EngineContext
+    work: EngineContext
 
 
 def propose_motion(
-    parts: Assembly, state: StreamState, frame: Frame, change: Change | None, tools: Tools,
+    assembly: Assembly,
+    state: StreamState,
+    frame: Frame,
+    change: Change | None,
+    tools: Tools,
     images: FrameImages | None = None,
-) -> Moved:  # fmt: skip
+) -> Moved:
     """Ask the motion part, and apply what it proposes as every player will.
 
     Raises ComponentError when the part fails, or proposes motions that do not fit the scene or cannot be sent.
     """
     scene, budget = state.player.scene, tools.budget
-    view = EngineContext(parts, state, frame, tools.log, change, 1.0 if budget is None else budget.part_scale, images)
-    proposed = parts.motion.propose(scene, view, tools.rng, state.motion_memory)
+    work = EngineContext(
+        assembly, state, frame, tools.log, change, 1.0 if budget is None else budget.part_scale, images
+    )
+    proposed = assembly.motion.propose(scene, work, tools.rng, state.motion_memory)
     motions = tuple(motion for motion in proposed if not motion.is_empty)
     if not motions:
-        return Moved((), scene, view)
-    with error_context("motion", parts.part("motion"), parts.where):
+        return Moved((), scene, work)
+    with error_context("motion", assembly.part("motion"), assembly.where):
         delta = Delta(motions)
         # What cannot be sent is refused before anything is learned on it.
         sections = encode_motions(delta.motions) + ([] if delta.field is None else encode_field(delta.field))
         most = None if budget is None else budget.max_bytes
-        share = 1.0 if parts.update.scope(frame.index) is Scope.NONE else MAX_SIZE_SHARE
+        share = 1.0 if assembly.update.scope(frame.index) is Scope.NONE else MAX_SIZE_SHARE
         if most is not None and sum(len(data) for _, data in sections) > share * most:
-            return Moved((), scene, view)
+            return Moved((), scene, work)
         scene, touched = apply_motions(scene, delta.motions)
         if delta.field is not None:
             scene, rows = apply_field(scene, delta.field)
             touched = union_rows(len(scene.gaussians), touched, rows)
-    gaussians = updated(view.gaussians, scene.gaussians, touched)
+    gaussians = updated(work.gaussians, scene.gaussians, touched)
     # The session is handed on to the moved scene, with its caches of all that stands still. The old session stays
     # correct, as it must until the frame has succeeded: should it be used again, it fills its caches anew.
     if 2 * len(touched) > len(gaussians):
-        return Moved(motions, scene, view.on(gaussians, None))
-    session = view.session.commit(gaussians, torch.from_numpy(touched).to(gaussians.means.device))
-    return Moved(motions, scene, view.on(gaussians, session))
+        return Moved(motions, scene, work.on(gaussians, None))
+    session = work.session.commit(gaussians, torch.from_numpy(touched).to(gaussians.means.device))
+    return Moved(motions, scene, work.on(gaussians, session))

@@ -20,8 +20,8 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.budget.epoch_scheduler import estimated_bytes
 from gsstream.engine.budget.schedule import Schedule
+from gsstream.engine.fit.constants import GATE_LR
 from gsstream.engine.fit.gates import TrainedGates
-from gsstream.engine.fit.schedule import GATE_LR
 from gsstream.engine.step.active.candidates import keep_mask
 from gsstream.engine.step.problem import Problem, Solution
 from gsstream.parts.gate.base import GateSampler
@@ -34,14 +34,14 @@ from gsstream.recipe.model import Stream
 MAX_RETAINED_SHARE = 0.9
 
 
-def optimise(parts: Assembly, problem: Problem, schedule: Schedule) -> Solution:
+def optimise(assembly: Assembly, problem: Problem, schedule: Schedule) -> Solution:
     """Minimise photometric loss + penalty + rate over the epochs of the schedule, one view per iteration.
 
     After every epoch rows whose gate has closed leave, but where the recipe lets everything take part.
     """
     if len(problem.rows) == 0:
         return Solution(problem.rows.cpu(), {}, {}, problem.logits.cpu())
-    fit, views, done, losses = _Fit(parts, problem, schedule), problem.views, 0, list[torch.Tensor]()
+    fit, views, done, losses = _Fit(assembly, problem, schedule), problem.views, 0, list[torch.Tensor]()
     schedule.start(len(problem.rows))
     while done < schedule.epochs:
         losses, some = [], schedule.chunk or views
@@ -54,7 +54,7 @@ def optimise(parts: Assembly, problem: Problem, schedule: Schedule) -> Solution:
         done += 1
         schedule.end_epoch(done)
         fit.open_gates.append(int(fit.opened().sum()))
-        if parts.recipe.stream.change_threshold > 0 and done < schedule.epochs:
+        if assembly.recipe.stream.change_threshold > 0 and done < schedule.epochs:
             fit.release(done / schedule.epochs)
             if len(fit.rows) == 0:
                 break
@@ -65,35 +65,41 @@ def optimise(parts: Assembly, problem: Problem, schedule: Schedule) -> Solution:
 class _Fit:
     """The moving state of one frame's optimisation; lives only inside :func:`optimise`."""
 
-    def __init__(self, parts: Assembly, problem: Problem, schedule: Schedule) -> None:
-        self.parts, self.problem, self.schedule, self.rows = parts, problem, schedule, problem.rows
+    def __init__(self, assembly: Assembly, problem: Problem, schedule: Schedule) -> None:
+        self.assembly, self.problem, self.schedule, self.rows = assembly, problem, schedule, problem.rows
         layout, index, device = problem.layout, problem.rows.cpu().numpy(), problem.rows.device
         self.levels = torch.from_numpy(layout.unit_of[index].astype("int64")).to(device)
-        self.stages = level_schedule(parts.recipe.stream, layout.unit_of)
-        latents = init_latents(parts.update, problem.base)
+        self.stages = level_schedule(assembly.recipe.stream, layout.unit_of)
+        latents = init_latents(assembly.update, problem.base)
         self.decoders = {name: problem.decoders[name].to(device) for name in latents if name in problem.decoders}
         self.code = joint_layout(
-            scale_steps(parts.update.codes(), problem.step_scale), latents, self.decoders, problem.base
+            scale_steps(assembly.update.codes(), problem.step_scale), latents, self.decoders, problem.base
         )
         units, matrix = torch.from_numpy(layout.units_of(index)).to(device), self.code.join_decoders(self.decoders)
-        self.residual = parts.optimiser.residual_optimiser(self.code, problem.base, units, matrix)
+        self.residual = assembly.optimiser.residual_optimiser(self.code, problem.base, units, matrix)
         self.gates = TrainedGates(
-            parts.gate, parts.regularizer, parts.optimiser, GATE_LR, problem.logits,
-            problem.hierarchy, problem.rows, problem.generator,
-        )  # fmt: skip
+            assembly.gate,
+            assembly.regularizer,
+            assembly.optimiser,
+            GATE_LR,
+            problem.logits,
+            problem.hierarchy,
+            problem.rows,
+            problem.generator,
+        )
         self.open_gates: list[int] = []
 
     def run(self, order: Sequence[int], first: int) -> list[torch.Tensor]:
         """Make one iteration on each of these views, the first with this number; return the photometric losses."""
-        total, final = self.schedule.epochs * self.problem.views, self.parts.recipe.stream.lr_final_factor
+        total, final = self.schedule.epochs * self.problem.views, self.assembly.recipe.stream.lr_final_factor
         iterations = [
             Iteration(view, self.problem.target(view), self.frozen(number / total), lr_factor(final, number, total))
             for number, view in enumerate(order, first)
         ]
         price = self.schedule.rd_lambda * bit_price_factor(self.problem.pixels) / self.problem.pixels
-        begin = partial(self.parts.where.iterate, first)
+        begin = partial(self.assembly.where.iterate, first)
         self.gates.draw_ahead(len(iterations))
-        with deferred_checks(self.parts.checks is not Checks.STEP):
+        with deferred_checks(self.assembly.checks is not Checks.STEP):
             return self.residual.run(ResidualEpoch(self.problem.session, iterations, self.gates, price, begin))
 
     def frozen(self, fraction: float) -> torch.Tensor | None:
@@ -102,7 +108,7 @@ class _Fit:
 
     def release(self, fraction: float) -> None:
         """Let go of the rows whose gate has closed: they no longer cost anything in this frame."""
-        keep = keep_mask(self.gates.final(), self.parts.gate.num_levels, self.gates.hierarchy, self.frozen(fraction))
+        keep = keep_mask(self.gates.final(), self.assembly.gate.num_levels, self.gates.hierarchy, self.frozen(fraction))
         if int(keep.sum()) > MAX_RETAINED_SHARE * len(keep):
             return
         rows = keep.nonzero()[:, 0]
@@ -113,7 +119,7 @@ class _Fit:
 
     def opened(self) -> torch.Tensor:
         """[M] bool: gates that would be sent open if this epoch were the last."""
-        return torch.round(self.gates.final() * self.parts.gate.num_levels) > 0
+        return torch.round(self.gates.final() * self.assembly.gate.num_levels) > 0
 
     def estimated_bytes(self) -> float:
         """Bytes of a packet if this epoch were the last: symbols behind open gates, and the gates."""
@@ -123,8 +129,8 @@ class _Fit:
 
     def solution(self, losses: Sequence[torch.Tensor], iterations: int) -> Solution:
         """What was found after so many iterations, and the mean of these losses."""
-        dead = count_dead_gates(self.parts.gate, self.gates.logits)
-        self.parts.where.pause()
+        dead = count_dead_gates(self.assembly.gate, self.gates.logits)
+        self.assembly.where.pause()
         self.schedule.finish()
         return Solution(
             rows=self.rows.cpu(),

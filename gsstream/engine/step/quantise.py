@@ -25,17 +25,17 @@ from gsstream.parts.update.base import scale_steps
 MAX_INT32_SYMBOL = 2.0**31 - 256
 
 
-def quantise_residual(parts: Assembly, problem: Problem, solution: Solution) -> Residual | None:
+def quantise_residual(assembly: Assembly, problem: Problem, solution: Solution) -> Residual | None:
     """Return the transmitted integers; None when nothing changes. A gate that opens for zeros alone is closed.
 
     Raises ComponentError when what was learned cannot be sent: not finite, or beyond symbols of 32 bits.
     """
-    check_solution(parts, problem, solution)
+    check_solution(assembly, problem, solution)
     layout = problem.layout
-    final = parts.gate.sample(solution.logits, None)
-    gates = torch.round(final * parts.gate.num_levels).numpy().astype(np.uint8)
+    final = assembly.gate.sample(solution.logits, None)
+    gates = torch.round(final * assembly.gate.num_levels).numpy().astype(np.uint8)
     rows = solution.rows.numpy()
-    codes = scale_steps(parts.update.codes(), problem.step_scale)
+    codes = scale_steps(assembly.update.codes(), problem.step_scale)
     integers = {name: value.numpy() for name, value in residual_symbols(codes, solution.latents).items()}
     changing = np.zeros(len(rows), bool)
     for value in integers.values():
@@ -50,13 +50,14 @@ def quantise_residual(parts: Assembly, problem: Problem, solution: Solution) -> 
     table = {name: value for name, value in table.items() if value.any()}
     decoders = {name: value.numpy() for name, value in solution.decoders.items() if name in table}
     steps = {name: codes[name].step for name in table}
-    return Residual(gates, parts.gate.num_levels, table, steps, quantise_decoders(decoders))
+    return Residual(gates, assembly.gate.num_levels, table, steps, quantise_decoders(decoders))
 
 
-def check_solution(parts: Assembly, problem: Problem, solution: Solution) -> None:
+def check_solution(assembly: Assembly, problem: Problem, solution: Solution) -> None:
     """Raise ComponentError unless what was learned can be sent: finite, and residuals within 32 bit symbols."""
-    codes, look = scale_steps(parts.update.codes(), problem.step_scale), Look(
-        parts.checks, "update", parts.part("update"), parts.where
+    codes, look = (
+        scale_steps(assembly.update.codes(), problem.step_scale),
+        Look(assembly.checks, "update", assembly.part("update"), assembly.where),
     )
     for name, value in solution.latents.items():
         most = codes[name].step * MAX_INT32_SYMBOL

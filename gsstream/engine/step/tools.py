@@ -32,7 +32,7 @@ def _not_resuming(index: int) -> Frame:
 class RunTools:
     """What a run lends to its method."""
 
-    parts: Assembly  # the live parts of the recipe
+    assembly: Assembly  # the live parts of the recipe
     rng: Rng  # random streams by name and frame
     meta: Callable[[Frame], StreamMeta]  # makes what a key packet says about the run, from the frame that is to be sent
     points: Callable[[Frame], PointCloud]  # makes the seeds of frame 0, from its training images
@@ -49,14 +49,14 @@ class RunTools:
 
     @property
     def renderer(self) -> Renderer:
-        return self.parts.renderer
+        return self.assembly.renderer
 
     @property
     def background(self) -> tuple[float, float, float]:
-        return self.parts.background
+        return self.assembly.background
 
     def epochs(self, frame: Frame) -> int:
-        epochs = self.parts.recipe.stream.epochs if self.budget is None else self.budget.epochs
+        epochs = self.assembly.recipe.stream.epochs if self.budget is None else self.budget.epochs
         return max(1, round(epochs * frame.epoch_scale))
 
     def since_key(self) -> Iterator[PlayerState]:
@@ -64,11 +64,11 @@ class RunTools:
 
     def first_frame(self, frame: Frame) -> FirstFrame:
         make = begin if self.first is None else reuse_first_frame
-        player = make(self.parts, frame, self).state.player
+        player = make(self.assembly, frame, self).state.player
         return FirstFrame(player.gaussians, player.layout, player.meta)
 
     def open(self, player: PlayerState, previous: Frame, frame: Frame) -> EngineContext:
         roots = torch.arange(len(player.layout.node_counts))
         forest = Hierarchy(torch.from_numpy(player.layout.node_of), roots, torch.zeros_like(roots))
         state = StreamState(player, forest, previous, exposure=exposure_from_meta(player.meta))
-        return EngineContext(self.parts, state, frame, self.log)
+        return EngineContext(self.assembly, state, frame, self.log)

@@ -24,10 +24,11 @@ REPAIRS: tuple[tuple[str, str, Repair], ...] = (
     ("camera-to-world matrices", "invert w2c", np.linalg.inv),
     ("OpenGL world-to-camera matrices (y up, z backwards)", "multiply rows 2 and 3 of w2c by -1", lambda m: _FLIP @ m),
     (
-        "OpenGL camera-to-world matrices (as in nerfstudio)", "multiply columns 2 and 3 by -1 and invert",
+        "OpenGL camera-to-world matrices (as in nerfstudio)",
+        "multiply columns 2 and 3 by -1 and invert",
         lambda m: np.linalg.inv(m @ _FLIP),
     ),
-)  # fmt: skip
+)
 
 
 def check_matches(cameras: Cameras, pairs: list[PairMatches], *, rig_only: bool = False) -> list[Finding]:
@@ -35,10 +36,15 @@ def check_matches(cameras: Cameras, pairs: list[PairMatches], *, rig_only: bool 
     pairs = [pair for pair in pairs if len(pair.first) >= MIN_MATCHES]
     limit = max(1.0, TOLERANCE * cameras.width)
     if len(pairs) < 2:
-        return [note("epipolar", (
-            f"the pictures of frame 0 share too few features to check the calibration ({len(pairs)} pairs of cameras "
-            f"with at least {MIN_MATCHES} matches); look at the first frame of a run instead"
-        ))]  # fmt: skip
+        return [
+            note(
+                "epipolar",
+                (
+                    f"the pictures of frame 0 share too few features to check the calibration ({len(pairs)} pairs of "
+                    f"cameras with at least {MIN_MATCHES} matches); look at the first frame of a run instead"
+                ),
+            )
+        ]
     bad = _suspect_cameras(cameras, pairs, limit)
     involved = {camera for pair in pairs for camera in pair.cameras}
     if not bad:
@@ -103,14 +109,20 @@ def _whole_rig(cameras: Cameras, pairs: list[PairMatches], limit: float) -> list
     for what, repair, change in REPAIRS:
         poses = np.stack([change(pose) for pose in cameras.viewmats])
         if _fits(replace(cameras, viewmats=poses), pairs, limit):
-            return [error("epipolar", (
-                f"the pictures contradict the poses, but fit when w2c is read as {what}: {repair}"
-            ))]  # fmt: skip
+            return [
+                error("epipolar", (f"the pictures contradict the poses, but fit when w2c is read as {what}: {repair}"))
+            ]
     usual = float(np.median([np.median(epipolar_errors(cameras, pair)) for pair in pairs]))
-    return [error("epipolar", (
-        f"the pictures contradict the calibration: matches lie {usual:.1f} pixels off their epipolar lines in most "
-        f"pairs of cameras, expected at most {limit:.1f}; calibrate again, or let 'gsstream scene prepare' do so"
-    ))]  # fmt: skip
+    return [
+        error(
+            "epipolar",
+            (
+                f"the pictures contradict the calibration: matches lie {usual:.1f} pixels off their epipolar lines in "
+                f"most pairs of cameras, expected at most {limit:.1f}; calibrate again, or let 'gsstream scene "
+                "prepare' do so"
+            ),
+        )
+    ]
 
 
 def _each(cameras: Cameras, pairs: list[PairMatches], bad: list[int], limit: float) -> list[Finding]:

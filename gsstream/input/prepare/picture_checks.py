@@ -47,9 +47,15 @@ def check_blank(thumbs: Thumbnails) -> list[Finding]:
         if 2 * len(frames) > len(flat):
             found.append(error("blank", f"camera {name!r} is {what} (mean {level:.2f}, no structure); take it out"))
         else:
-            found.append(error("blank", (
-                f"camera {name!r}: {_listed(frames)} {what} (no structure); export again, or end the recording before"
-            )))  # fmt: skip
+            found.append(
+                error(
+                    "blank",
+                    (
+                        f"camera {name!r}: {_listed(frames)} {what} (no structure); export again, or end the "
+                        "recording before"
+                    ),
+                )
+            )
     return found
 
 
@@ -61,10 +67,15 @@ def check_same(thumbs: Thumbnails) -> list[Finding]:
             if np.array_equal(first[a], first[b]):
                 leak = a < thumbs.train <= b
                 kinds = "a training camera and a test camera" if leak else "two cameras"
-                found.append(error("same", (
-                    f"cameras {thumbs.cameras.ids[a]!r} and {thumbs.cameras.ids[b]!r}, {kinds}, show the same "
-                    "pictures; take one of them out, or export the right ones"
-                )))  # fmt: skip
+                found.append(
+                    error(
+                        "same",
+                        (
+                            f"cameras {thumbs.cameras.ids[a]!r} and {thumbs.cameras.ids[b]!r}, {kinds}, show the same "
+                            "pictures; take one of them out, or export the right ones"
+                        ),
+                    )
+                )
     return found
 
 
@@ -77,20 +88,29 @@ def check_change(thumbs: Thumbnails) -> list[Finding]:
     busy = still.mean(1) < 0.5
     frozen = still[busy].all(0) if busy.any() else np.zeros(still.shape[1], bool)
     found = [
-        error("frozen", (
-            f"camera {name!r} shows one picture in all {len(thumbs.images)} frames while others change; check its "
-            "capture, or take it out"
-        ))
-        for name, stands in zip(thumbs.cameras.ids, frozen, strict=True) if stands
-    ]  # fmt: skip
+        error(
+            "frozen",
+            (
+                f"camera {name!r} shows one picture in all {len(thumbs.images)} frames while others change; check its "
+                "capture, or take it out"
+            ),
+        )
+        for name, stands in zip(thumbs.cameras.ids, frozen, strict=True)
+        if stands
+    ]
     usual = still.mean(0) <= 0.2
     for c in np.flatnonzero(usual & ~frozen):
         frames = np.flatnonzero(still[:, c] & (still.mean(1) < 0.3)) + 1
         if len(frames):
-            found.append(error("repeated", (
-                f"camera {thumbs.cameras.ids[c]!r}: {_listed(frames)} the same picture as the one before while others "
-                "go on; a frame was lost there. Export again, and check that the rest is in step"
-            )))  # fmt: skip
+            found.append(
+                error(
+                    "repeated",
+                    (
+                        f"camera {thumbs.cameras.ids[c]!r}: {_listed(frames)} the same picture as the one before "
+                        "while others go on; a frame was lost there. Export again, and check that the rest is in step"
+                    ),
+                )
+            )
     return found or check_brightness(thumbs)
 
 
@@ -100,19 +120,27 @@ def check_brightness(thumbs: Thumbnails) -> list[Finding]:
     steps = np.median(np.diff(logs, axis=0), axis=(2, 3))
     common = np.median(steps, axis=1)
     found = [
-        warning("brightness", (
-            f"all cameras change by {100 * (np.exp(common[t]) - 1):+.0f} % in brightness at frame {t + 1}: light or "
-            "exposure. Lock the exposure; a stream pays for such a frame with a large packet"
-        ))
+        warning(
+            "brightness",
+            (
+                f"all cameras change by {100 * (np.exp(common[t]) - 1):+.0f} % in brightness at frame {t + 1}: light "
+                "or exposure. Lock the exposure; a stream pays for such a frame with a large packet"
+            ),
+        )
         for t in np.flatnonzero(np.abs(common) > JUMP)
-    ]  # fmt: skip
+    ]
     own = np.abs(steps - common[:, None])
     for c in np.flatnonzero(own.max(0) > JUMP):
         when = int(own[:, c].argmax())
-        found.append(warning("brightness", (
-            f"camera {thumbs.cameras.ids[c]!r} jumps by {100 * (np.exp(steps[when, c]) - 1):+.0f} % in brightness at "
-            f"frame {when + 1}, alone; switch its automatic exposure off"
-        )))  # fmt: skip
+        found.append(
+            warning(
+                "brightness",
+                (
+                    f"camera {thumbs.cameras.ids[c]!r} jumps by {100 * (np.exp(steps[when, c]) - 1):+.0f} % in "
+                    f"brightness at frame {when + 1}, alone; switch its automatic exposure off"
+                ),
+            )
+        )
     return found
 
 

@@ -75,11 +75,16 @@ def check_poses(frame: Frame) -> list[Finding]:
     if best < max(LEAST, TIMES * given):
         return []
     what, cure, _ = REPAIRS[shares.index(best)]
-    return [error("axes", (
-        f"the pictures of frame {frame.index} fit each other if the poses are {what}, and not as they are given "
-        f"({100 * best:.0f} % of their texture is at one place for several cameras, instead of {100 * given:.0f} %): "
-        f"{cure}"
-    ))]  # fmt: skip
+    return [
+        error(
+            "axes",
+            (
+                f"the pictures of frame {frame.index} fit each other if the poses are {what}, and not as they are "
+                f"given ({100 * best:.0f} % of their texture is at one place for several cameras, instead of "
+                f"{100 * given:.0f} %): {cure}"
+            ),
+        )
+    ]
 
 
 def check_swapped(frame: Frame) -> list[Finding]:
@@ -100,10 +105,15 @@ def check_swapped(frame: Frame) -> list[Finding]:
         moved = replace(cameras, viewmats=cameras.viewmats[order], Ks=cameras.Ks[order])
         after = agreements(images, moved, SETTINGS, views=(a, b), limit=SAME)
         if (after > np.maximum(EXCHANGED * own[[a, b]], usual / 2)).all():
-            return [error("axes", (
-                f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r} are swapped: the pictures of frame {frame.index} "
-                "fit with each other's pose; exchange their images or their poses"
-            ))]  # fmt: skip
+            return [
+                error(
+                    "axes",
+                    (
+                        f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r} are swapped: the pictures of frame "
+                        f"{frame.index} fit with each other's pose; exchange their images or their poses"
+                    ),
+                )
+            ]
     return []
 
 

@@ -20,8 +20,8 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError, OutputError
 from gsstream.core.frame import PointCloud
 from gsstream.core.names import child
+from gsstream.core.progress import Tell, silent
 from gsstream.core.shapes import FloatArray
-from gsstream.core.signs import Tell, silent
 from gsstream.input.prepare.given import GivenRig, read_raw
 from gsstream.input.prepare.raw import RawCamera, first_frames
 from gsstream.input.prepare.undistort import Undistortion, undistortion
@@ -94,9 +94,7 @@ def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say, tell:
     say(f"placed {len(kept)} of {len(names)} cameras, {len(mapping.xyz)} points")
     lenses = _pinholes([cameras[i] for i in kept], mapping, kept, options)
     target = _target([cameras[i] for i in kept], options)
-    rig = Cameras(
-        tuple(names[i] for i in kept), mapping.viewmats[kept], np.stack([K for K, _ in lenses]), *target
-    )  # fmt: skip
+    rig = Cameras(tuple(names[i] for i in kept), mapping.viewmats[kept], np.stack([K for K, _ in lenses]), *target)
     found = _points(mapping, rig, options)
     points, bounds = found if found else (None, None)
     say(f"kept {len(found[0]) if found else 'no'} points; writing pictures")
@@ -112,9 +110,13 @@ def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say, tell:
 
 
 def _map(
-    cameras: list[RawCamera], images: list[FloatArray], known: GivenRig | None, test: Sequence[str],
-    options: PrepareOptions, tell: Tell,
-) -> Mapping:  # fmt: skip
+    cameras: list[RawCamera],
+    images: list[FloatArray],
+    known: GivenRig | None,
+    test: Sequence[str],
+    options: PrepareOptions,
+    tell: Tell,
+) -> Mapping:
     one_size = len({camera.size for camera in cameras}) == 1
     held = [i for i, camera in enumerate(cameras) if camera.name in test]
     if known is None:
@@ -138,9 +140,12 @@ def _map(
 
 
 def _flat(
-    image: FloatArray, size: tuple[int, int], lens: Lens, target: tuple[int, int],
+    image: FloatArray,
+    size: tuple[int, int],
+    lens: Lens,
+    target: tuple[int, int],
     made: dict[tuple[Lens, tuple[int, int]], Undistortion],
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+) -> tuple[FloatArray, FloatArray]:
     """(K, picture) of a pinhole camera of the target size; ``made`` keeps what equal lenses share."""
     if not lens.distorts and size == target:
         return lens.K, image
@@ -230,20 +235,38 @@ def _write_pictures(
 
 
 def _write(
-    out: Path, title: str, rig: Cameras, test: Sequence[str], found: tuple[PointCloud, FloatArray] | None, frames: int,
-    fps: float, licence: str,
-) -> None:  # fmt: skip
+    out: Path,
+    title: str,
+    rig: Cameras,
+    test: Sequence[str],
+    found: tuple[PointCloud, FloatArray] | None,
+    frames: int,
+    fps: float,
+    licence: str,
+) -> None:
     entries: list[dict[str, Any]] = []
     for i, name in enumerate(rig.ids):
         suffix = next((out / name).glob("000000.*")).suffix
-        entries.append({
-            "id": name, "split": "test" if name in test else "train", "width": rig.width, "height": rig.height,
-            "K": rig.Ks[i].tolist(), "w2c": rig.viewmats[i].tolist(), "frames": f"{name}/%06d{suffix}",
-        })  # fmt: skip
+        entries.append(
+            {
+                "id": name,
+                "split": "test" if name in test else "train",
+                "width": rig.width,
+                "height": rig.height,
+                "K": rig.Ks[i].tolist(),
+                "w2c": rig.viewmats[i].tolist(),
+                "frames": f"{name}/%06d{suffix}",
+            }
+        )
     data = {
-        "schema": SCHEMA, "name": title, "fps": fps, "frames": frames, "licence": licence,
-        **({"bounds": found[1].tolist()} if found else {}), "cameras": entries,
-    }  # fmt: skip
+        "schema": SCHEMA,
+        "name": title,
+        "fps": fps,
+        "frames": frames,
+        "licence": licence,
+        **({"bounds": found[1].tolist()} if found else {}),
+        "cameras": entries,
+    }
     (out / CALIBRATION_FILE).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
     if found:
         points = found[0]

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from gsstream.core.errors import ShapeError, SourceError
+from gsstream.core.install_hints import install_extra
 from gsstream.core.names import check_camera_ids
-from gsstream.core.needs import install_extra
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.clips import Clip
 from gsstream.input.recordings.images import PICTURE_FORMATS, read_image, told_apart

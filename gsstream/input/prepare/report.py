@@ -71,9 +71,17 @@ def _draw(path: Path, made: Prepared) -> None:
             if mask.any():
                 place, way = centers[mask], length * forward[mask]
                 plot.quiver(
-                    place @ right, place @ top, way @ right, way @ top, color=color, label=label, angles="xy",
-                    scale_units="xy", scale=1, width=0.004,
-                )  # fmt: skip
+                    place @ right,
+                    place @ top,
+                    way @ right,
+                    way @ top,
+                    color=color,
+                    label=label,
+                    angles="xy",
+                    scale_units="xy",
+                    scale=1,
+                    width=0.004,
+                )
         flat = np.concatenate([xyz, centers]) @ np.stack([right, top]).T
         low, high = np.percentile(flat, [1, 99], axis=0)
         plot.set_xlim(min(low[0], (centers @ right).min()) - length, max(high[0], (centers @ right).max()) + length)

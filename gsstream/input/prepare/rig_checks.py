@@ -25,20 +25,31 @@ def check_intrinsics(cameras: Cameras) -> list[Finding]:
         where = f"camera {name!r}: the principal point is at {point} of {width} x {height} pixels"
         scale = 2 * share.mean()
         if abs(scale - 1) > 0.3 and abs(share[0] - share[1]) < 0.1 * share.mean():
-            found.append(error("intrinsics", (
-                f"{where}; K looks like that of images of {round(width * scale)} x {round(height * scale)}. "
-                f"Multiply the first two rows of K by {1 / scale:.3g}"
-            )))  # fmt: skip
+            found.append(
+                error(
+                    "intrinsics",
+                    (
+                        f"{where}; K looks like that of images of {round(width * scale)} x {round(height * scale)}. "
+                        f"Multiply the first two rows of K by {1 / scale:.3g}"
+                    ),
+                )
+            )
         elif not ((share > 0) & (share < 1)).all():
             found.append(error("intrinsics", f"{where}, outside of the image; check cx and cy (pixels, not fractions)"))
         elif abs(share - 0.5).max() > 0.25:
             found.append(warning("intrinsics", f"{where}, far from the centre; check cx and cy"))
         angles = np.degrees(2 * np.arctan(np.array([width / K[0, 0], height / K[1, 1]]) / 2))
         if angles.max() > 150 or angles.min() < 2:
-            found.append(error("intrinsics", (
-                f"camera {name!r}: focal lengths {K[0, 0]:.4g} and {K[1, 1]:.4g} pixels mean a field of view of "
-                f"{angles[0]:.0f} x {angles[1]:.0f} degrees; expected 2 to 150. Give focal lengths in pixels"
-            )))  # fmt: skip
+            found.append(
+                error(
+                    "intrinsics",
+                    (
+                        f"camera {name!r}: focal lengths {K[0, 0]:.4g} and {K[1, 1]:.4g} pixels mean a field of view "
+                        f"of {angles[0]:.0f} x {angles[1]:.0f} degrees; expected 2 to 150. Give focal lengths in "
+                        "pixels"
+                    ),
+                )
+            )
     return found
 
 
@@ -57,20 +68,29 @@ def check_placement(cameras: Cameras, train: int, points: PointCloud | None) -> 
         leak = a < train <= b
         advice = "nothing is tested that was not trained on: take one of them out" if leak else "take one of them out"
         kinds = "a training camera and a test camera" if leak else "two cameras"
-        found.append(error("placement", (
-            f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r}, {kinds}, have the same pose; {advice}, or correct w2c"
-        )))  # fmt: skip
+        found.append(
+            error(
+                "placement",
+                (
+                    f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r}, {kinds}, have the same pose; {advice}, or "
+                    "correct w2c"
+                ),
+            )
+        )
     if len(same) == 0 and len(cameras) > 3:
         middle = np.median(centers, axis=0)
         distance = np.linalg.norm(centers - middle, axis=1)
         usual = float(np.median(distance))
         found = [
-            error("placement", (
-                f"camera {cameras.ids[i]!r} is {distance[i]:.4g} units away from the middle of the rig, the others "
-                f"about {usual:.4g}; its translation is probably in another unit (mm instead of m?)"
-            ))
+            error(
+                "placement",
+                (
+                    f"camera {cameras.ids[i]!r} is {distance[i]:.4g} units away from the middle of the rig, the others "
+                    f"about {usual:.4g}; its translation is probably in another unit (mm instead of m?)"
+                ),
+            )
             for i in np.flatnonzero(distance > FAR * max(usual, 1e-12))
-        ]  # fmt: skip
+        ]
     if not found and points is not None and len(points) > 10:
         found = _points_unit(cameras, points)
     return found
@@ -81,10 +101,15 @@ def _points_unit(cameras: Cameras, points: PointCloud) -> list[Finding]:
     ratio = spread / cameras.extent
     if 1 / FAR < ratio < FAR:
         return []
-    return [error("placement", (
-        f"the points of frame 0 spread over {spread:.4g} units, the rig over {cameras.extent:.4g}: one of them is "
-        "probably in mm and the other in m; bring poses and points to one unit"
-    ))]  # fmt: skip
+    return [
+        error(
+            "placement",
+            (
+                f"the points of frame 0 spread over {spread:.4g} units, the rig over {cameras.extent:.4g}: one of "
+                "them is probably in mm and the other in m; bring poses and points to one unit"
+            ),
+        )
+    ]
 
 
 def check_axes(cameras: Cameras) -> list[Finding]:
@@ -95,11 +120,16 @@ def check_axes(cameras: Cameras) -> list[Finding]:
     depth = (cameras.viewmats[:, 2, :3] @ focus) + cameras.viewmats[:, 2, 3]
     across = np.linalg.norm(cameras.viewmats[:, 2, :3] - cameras.viewmats[:, 2, :3].mean(0), axis=1)
     if (depth < 0).all() and float(across.mean()) > 0.1:
-        return [error("axes", (
-            "every camera has the point where the optical axes meet behind it: the poses look like those of OpenGL "
-            "(y up, z backwards). Multiply the second and third row of w2c by -1. A rig that looks outwards has no "
-            "common view to reconstruct"
-        ))]  # fmt: skip
+        return [
+            error(
+                "axes",
+                (
+                    "every camera has the point where the optical axes meet behind it: the poses look like those of "
+                    "OpenGL (y up, z backwards). Multiply the second and third row of w2c by -1. A rig that looks "
+                    "outwards has no common view to reconstruct"
+                ),
+            )
+        ]
     return []
 
 
@@ -117,10 +147,15 @@ def check_overlap(cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
         seen = visible_views(_view_points(cameras, i), cameras)[:, others]
         share = float(seen.any(1).mean())
         if share < MIN_OVERLAP:
-            found.append(error("overlap", (
-                f"camera {name!r} shares its view with no other training camera ({100 * share:.0f} % of it); check its "
-                "pose, or take it out"
-            )))  # fmt: skip
+            found.append(
+                error(
+                    "overlap",
+                    (
+                        f"camera {name!r} shares its view with no other training camera ({100 * share:.0f} % of it); "
+                        "check its pose, or take it out"
+                    ),
+                )
+            )
     return found
 
 

@@ -73,10 +73,13 @@ def _told(name: str, clock: Clock, reach: int) -> Finding:
     cure = f"Shift its frames by {-late:+d}, or run with --source disturbed:time_offset={name}@{late}:SOURCE"
     if clock.ended:
         cure = f"No larger offset was tried; more are with --frames {math.ceil(2 * reach / REACH)}"
-    return error("sync", (
-        f"camera {name!r} is {count} {'late' if late > 0 else 'early'}: what moves is at another place than in the "
-        f"other cameras. {cure}"
-    ))  # fmt: skip
+    return error(
+        "sync",
+        (
+            f"camera {name!r} is {count} {'late' if late > 0 else 'early'}: what moves is at another place than in the "
+            f"other cameras. {cure}"
+        ),
+    )
 
 
 def _unknown(cameras: Cameras, seen: list[Motion], lost: list[int]) -> list[Finding]:
@@ -84,10 +87,15 @@ def _unknown(cameras: Cameras, seen: list[Motion], lost: list[int]) -> list[Find
         return []
     share = 100 * float(np.mean([seen[c].share for c in lost]))
     which = "" if len(lost) == len(cameras) else f" of {', '.join(cameras.ids[c] for c in lost)}"
-    return [note("sync", (
-        f"clocks{which}: not checkable (what moves covers {share:.1g} % of the pictures from one frame to the next); "
-        "more frames may show more"
-    ))]  # fmt: skip
+    return [
+        note(
+            "sync",
+            (
+                f"clocks{which}: not checkable (what moves covers {share:.1g} % of the pictures from one frame to the "
+                "next); more frames may show more"
+            ),
+        )
+    ]
 
 
 def _curves(cameras: Cameras, seen: list[Motion], reach: int) -> FloatArray:
@@ -195,10 +203,15 @@ def _swapped(cameras: Cameras, seen: list[Motion], now: FloatArray) -> list[Find
     for a, b in combinations(sorted(suspects), 2):
         changed = min(_fit(cameras, seen, x, y, (a, b)) - own[x] for x, y in ((a, b), (b, a)))
         if changed > EXCHANGED and min(own[a], own[b]) + changed > ALIKE:
-            found.append(error("sync", (
-                f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r} are swapped: each sees what moves where the "
-                "other should; exchange their images or their poses"
-            )))  # fmt: skip
+            found.append(
+                error(
+                    "sync",
+                    (
+                        f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r} are swapped: each sees what moves where "
+                        "the other should; exchange their images or their poses"
+                    ),
+                )
+            )
     return found
 
 
@@ -208,10 +221,15 @@ def _better_poses(cameras: Cameras, seen: list[Motion], curves: FloatArray) -> l
     for what, cure, repair in REPAIRS:
         poses = np.stack([repair(pose) for pose in cameras.viewmats])
         if _on_time(_curves(replace(cameras, viewmats=poses), seen, 0)) > max(ALIKE, 1.5 * given):
-            return [error("axes", (
-                f"what moves is at one place in all cameras if the poses are {what}, and at several places as they are "
-                f"given: {cure}. Clocks were compared by poses that do not fit"
-            ))]  # fmt: skip
+            return [
+                error(
+                    "axes",
+                    (
+                        f"what moves is at one place in all cameras if the poses are {what}, and at several places as "
+                        f"they are given: {cure}. Clocks were compared by poses that do not fit"
+                    ),
+                )
+            ]
     return []
 
 

@@ -95,7 +95,9 @@ def _border(width: int, height: int) -> FloatArray:
     """Pixel positions along the edges of a picture."""
     x, y = np.linspace(0, width, 33), np.linspace(0, height, 33)
     sides = [
-        np.stack([x, np.zeros_like(x)], 1), np.stack([x, np.full_like(x, height)], 1),
-        np.stack([np.zeros_like(y), y], 1), np.stack([np.full_like(y, width), y], 1),
-    ]  # fmt: skip
+        np.stack([x, np.zeros_like(x)], 1),
+        np.stack([x, np.full_like(x, height)], 1),
+        np.stack([np.zeros_like(y), y], 1),
+        np.stack([np.full_like(y, width), y], 1),
+    ]
     return np.concatenate(sides)

@@ -13,7 +13,7 @@ from dataclasses import replace
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError, SourceError
 from gsstream.core.frame import Frame, join_frames, shrink_frame
-from gsstream.core.needs import install_extra
+from gsstream.core.install_hints import install_extra
 from gsstream.input.prepare.findings import Finding, error, note
 from gsstream.input.prepare.match_checks import check_matches
 from gsstream.input.prepare.picture_checks import Thumbnails, check_blank, check_change, check_same, read_thumbnails

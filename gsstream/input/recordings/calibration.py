@@ -13,8 +13,8 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError, SourceError
+from gsstream.core.install_hints import page
 from gsstream.core.names import check_camera_ids
-from gsstream.core.needs import page
 from gsstream.input.recordings.base import Split
 from gsstream.input.recordings.clips import VIDEO_SUFFIXES, prepare_command
 from gsstream.input.recordings.distortion import Lens

@@ -135,8 +135,9 @@ def read_points(path: Path, kind: PointKind) -> PointCloud:
             warnings.warn(
                 f"{path}: {prefix}xyz is float32, whose steps are {step:.2g} this far from the origin, and the points "
                 f"spread over {spread:.2g}: write float64, or move poses and points to the origin",
-                RecordingWarning, stacklevel=2,
-            )  # fmt: skip
+                RecordingWarning,
+                stacklevel=2,
+            )
     if trust is not None:
         kept = _trusted(path, f"{prefix}confidence", trust, len(xyz))
         xyz, rgb = xyz[kept], rgb[kept]

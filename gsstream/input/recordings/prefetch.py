@@ -31,9 +31,14 @@ class Prefetcher:
     """
 
     def __init__(
-        self, source: FrameSource, indices: Iterable[int], *, depth: int | None = None, workers: int = 1,
+        self,
+        source: FrameSource,
+        indices: Iterable[int],
+        *,
+        depth: int | None = None,
+        workers: int = 1,
         pack: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         if depth is None:
             depth = 1 if _pair_bytes(source) > LARGE_PAIR else 2
         if depth < 1 or workers < 1:

@@ -74,8 +74,7 @@ class SyntheticSource:
 
     @classmethod
     def from_query(cls, query: str, *, scale: float = 1.0, uri: str | None = None) -> SyntheticSource:
-        """Build from ``"frames=40&views=8"``. Raises SourceError naming the option that is unknown or out of range.
-        """
+        """Build from ``"frames=40&views=8"``. Raises SourceError naming the option that is unknown or out of range."""
         options = options_of_query(SyntheticOptions, query.lstrip("?"), "synthetic source")
         return cls(options, scale=scale, uri=f"synthetic:{query}" if uri is None else uri)
 

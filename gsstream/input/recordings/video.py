@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gsstream.core.errors import SourceError
-from gsstream.core.needs import install_extra
+from gsstream.core.install_hints import install_extra
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.images import shrink
 

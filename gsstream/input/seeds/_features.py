@@ -46,9 +46,13 @@ def extract(folder: Path, most: int, mode: str = "PER_IMAGE", model: str = "SIMP
     for begin in range(0, len(names), step):
         sign(begin, len(names), "finding features: pictures")
         pycolmap.extract_features(
-            scratch, folder / IMAGES, image_names=names[begin : begin + step],
-            camera_mode=getattr(pycolmap.CameraMode, mode), reader_options=reader, extraction_options=extraction,
-        )  # fmt: skip
+            scratch,
+            folder / IMAGES,
+            image_names=names[begin : begin + step],
+            camera_mode=getattr(pycolmap.CameraMode, mode),
+            reader_options=reader,
+            extraction_options=extraction,
+        )
         if mode == "SINGLE" and begin == 0:
             with pycolmap.Database.open(scratch) as db:
                 reader.existing_camera_id = db.read_all_images()[0].camera_id

@@ -201,9 +201,12 @@ def _map(folder: Path, database: Path, names: list[str], turn: str) -> Any:
         sparse.mkdir()
         sign(0, 0, "placing cameras")
         mapped = pycolmap.incremental_mapping(
-            database, folder / IMAGES, sparse, options=options,
+            database,
+            folder / IMAGES,
+            sparse,
+            options=options,
             next_image_callback=lambda: sign(min(next(placed), len(names)), len(names), "placing cameras: placed"),
-        )  # fmt: skip
+        )
         for made in mapped.values():
             score = (made.num_reg_images(), -made.compute_mean_reprojection_error())
             if best is None or score > rank:

@@ -12,9 +12,9 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
-from gsstream.core.needs import page
+from gsstream.core.install_hints import page
+from gsstream.core.progress import Tell, silent
 from gsstream.core.shapes import BoolArray, FloatArray, IntArray
-from gsstream.core.signs import Tell, silent
 from gsstream.input.seeds.sfm import run_pycolmap, write_images, write_rig
 
 #: Number of focal lengths among the parameters of a lens model; the principal point follows, then the distortion.
@@ -69,9 +69,15 @@ class Mapping:
 
 
 def reconstruct(
-    images: Sequence[FloatArray] | FloatArray, *, model: str = "SIMPLE_RADIAL", shared: bool = True,
-    held: Sequence[int] = (), names: Sequence[str] = (), timeout: float = 1800.0, tell: Tell = silent,
-) -> Mapping:  # fmt: skip
+    images: Sequence[FloatArray] | FloatArray,
+    *,
+    model: str = "SIMPLE_RADIAL",
+    shared: bool = True,
+    held: Sequence[int] = (),
+    names: Sequence[str] = (),
+    timeout: float = 1800.0,
+    tell: Tell = silent,
+) -> Mapping:
     """Map C images [H, W, 3] in [0, 1] of one instant; of different sizes, unless they share a lens.
 
     ``names``: of the cameras, for messages. The same input gives the same result. Raises InputError when pycolmap is

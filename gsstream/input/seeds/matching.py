@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gsstream.core.progress import Tell, silent
 from gsstream.core.shapes import FloatArray
-from gsstream.core.signs import Tell, silent
 from gsstream.input.seeds.sfm import run_pycolmap, write_images
 
 

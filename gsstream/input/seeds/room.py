@@ -19,9 +19,9 @@ import torch
 import torch.nn.functional as F
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.progress import Tell, silent
 from gsstream.core.projection import inside, project
 from gsstream.core.shapes import BoolArray, FloatArray
-from gsstream.core.signs import Tell, silent
 from gsstream.input.seeds.fusion import agreement, world_points
 from gsstream.input.seeds.geometry import focus_point, neighbour_views, pixel_centers, spread_views
 from gsstream.input.seeds.window import window_mean
@@ -91,9 +91,14 @@ def stands_around(cameras: Cameras) -> bool:
 
 
 def with_room(
-    images: FloatArray, cameras: Cameras, swept: FloatArray, depths: FloatArray, accepted: BoolArray,
-    given: BoolArray, tell: Tell = silent,
-) -> tuple[FloatArray, BoolArray]:  # fmt: skip
+    images: FloatArray,
+    cameras: Cameras,
+    swept: FloatArray,
+    depths: FloatArray,
+    accepted: BoolArray,
+    given: BoolArray,
+    tell: Tell = silent,
+) -> tuple[FloatArray, BoolArray]:
     """Return depths [C, H, W] of which those of the room stand in where the sweep is not sure, and which are seeds.
 
     A pixel gets no seed where another camera contradicts the wall: it sees the place, with texture, and other colours.
@@ -135,6 +140,7 @@ def find_room(images: FloatArray, cameras: Cameras, tell: Tell = silent) -> Room
     size = float(np.linalg.norm(cameras.centers - focus, axis=1).mean())
     counted = itertools.count(1)
     with one_thread_each() as pool:
+
         def agrees(surface: FloatArray) -> float:
             tell("looking for points: rooms tried", next(counted), SPHERE.total + FLOOR.total)
             return surface_agreement(grey, cameras, surface, pool)
@@ -219,9 +225,7 @@ def _climb(
     return best
 
 
-def surface_agreement(
-    grey: torch.Tensor, cameras: Cameras, surface: FloatArray, pool: ThreadPoolExecutor
-) -> float:
+def surface_agreement(grey: torch.Tensor, cameras: Cameras, surface: FloatArray, pool: ThreadPoolExecutor) -> float:
     """Return how well pictures [C, H, W] agree on a surface [R, S, 3]: 0 to 1.
 
     It is the mean correlation, negative ones as 0, over all pairs of cameras and textured places; less where there are

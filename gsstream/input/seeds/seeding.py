@@ -12,8 +12,8 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
 from gsstream.core.frame import PointCloud
+from gsstream.core.progress import Tell, silent
 from gsstream.core.shapes import BoolArray, FloatArray, check_finite, check_shape
-from gsstream.core.signs import Tell, silent
 from gsstream.input.seeds.fusion import agreement, color_gains, interpolate_depths, world_points
 from gsstream.input.seeds.room import stands_around, with_room
 from gsstream.input.seeds.sweep import SweepSettings, sweep_depths
@@ -81,9 +81,7 @@ def photo_consistent_seeds(
     depths = interpolate_depths(swept, sure)
     verdict = agreement(depths, cameras, tolerance)
     # The depth of an interpolated pixel was not matched, so twice as many views must support it.
-    accepted = np.where(
-        sure, verdict.accepted(min_support, dominance), verdict.accepted(min_support, 2 * dominance)
-    )
+    accepted = np.where(sure, verdict.accepted(min_support, dominance), verdict.accepted(min_support, 2 * dominance))
     confidence = verdict.support / np.maximum(verdict.support + verdict.violation, 1) * accepted
     accepted |= given
     if stands_around(cameras):

@@ -18,9 +18,9 @@ from PIL import Image
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
 from gsstream.core.frame import PointCloud
-from gsstream.core.needs import install_extra
+from gsstream.core.install_hints import install_extra
+from gsstream.core.progress import Tell, silent
 from gsstream.core.shapes import FloatArray, check_finite, check_shape
-from gsstream.core.signs import Tell, silent
 
 
 def triangulate_points(
@@ -78,9 +78,12 @@ def run_pycolmap(task: str, folder: Path, timeout: float, tell: Tell = silent) -
         )
     command = [sys.executable, "-m", "gsstream.input.seeds._pycolmap", task, str(folder)]
     # COLMAP's logger leaves a file for every process where temporary files go: that folder is removed with the rest.
-    with (folder / "log.txt").open("w") as log, subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=log, text=True, env={**os.environ, "TMPDIR": str(folder)}
-    ) as process:  # fmt: skip
+    with (
+        (folder / "log.txt").open("w") as log,
+        subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=log, text=True, env={**os.environ, "TMPDIR": str(folder)}
+        ) as process,
+    ):
         late = threading.Timer(timeout, process.kill)
         late.start()
         try:

@@ -16,8 +16,8 @@ import torch
 import torch.nn.functional as F
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.progress import Tell, silent
 from gsstream.core.shapes import FloatArray, check_shape
-from gsstream.core.signs import Tell, silent
 from gsstream.input.seeds.aggregate import aggregate, best_plane
 from gsstream.input.seeds.geometry import depth_range, neighbour_views, pixel_centers
 from gsstream.input.seeds.window import window_mean
@@ -111,9 +111,14 @@ def agreements(
 
 
 def _matching_cost(
-    grey: torch.Tensor, cameras: Cameras, view: int, partners: list[int], inverse: FloatArray, settings: SweepSettings,
+    grey: torch.Tensor,
+    cameras: Cameras,
+    view: int,
+    partners: list[int],
+    inverse: FloatArray,
+    settings: SweepSettings,
     stop: threading.Event | None = None,
-) -> FloatArray:  # fmt: skip
+) -> FloatArray:
     """[D, H, W] mean of the two best neighbours' (1 - NCC) / 2, in [0, 1]; half done where it was stopped."""
     height, width = grey.shape[1:]
     reference = grey[view][None, None]

@@ -35,10 +35,21 @@ def encode_field(change: Field) -> list[tuple[str, bytes]]:
     if problem:
         raise ShapeError(f"field: {problem}")
     head = _HEAD.pack(
-        _MARKED * (change.marks is not None), shape.levels, shape.entries, shape.features, shape.width, shape.layers,
-        shape.base, shape.seed, change.entry_step, change.weight_step, shape.growth, shape.reach, *shape.low,
+        _MARKED * (change.marks is not None),
+        shape.levels,
+        shape.entries,
+        shape.features,
+        shape.width,
+        shape.layers,
+        shape.base,
+        shape.seed,
+        change.entry_step,
+        change.weight_step,
+        shape.growth,
+        shape.reach,
+        *shape.low,
         *shape.high,
-    )  # fmt: skip
+    )
     marks = b"" if change.marks is None else encode_gates(np.asarray(change.marks, np.uint8), 1)
     return [("field", head + pack_blobs([marks, *map(encode_symbols, tables)]))]
 
@@ -61,9 +72,18 @@ def _decode(data: bytes, scene: Scene) -> Field:
     if flags & ~_MARKED:
         raise PacketError(f"field: unknown flags {flags}; upgrade gsstream")
     shape = FieldShape(
-        (box[0], box[1], box[2]), (box[3], box[4], box[5]), reach, levels, entries, features, base, growth, width,
-        layers, seed,
-    )  # fmt: skip
+        (box[0], box[1], box[2]),
+        (box[3], box[4], box[5]),
+        reach,
+        levels,
+        entries,
+        features,
+        base,
+        growth,
+        width,
+        layers,
+        seed,
+    )
     problem = shape.problem() or _steps(entry_step, weight_step)
     if problem:
         raise PacketError(f"field: {problem}")

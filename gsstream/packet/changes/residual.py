@@ -16,7 +16,7 @@ from gsstream.packet.base import (
     WIDTHS,
     Section,
     add_offset,
-)  # fmt: skip
+)
 from gsstream.packet.gates import decode_gates, encode_gates
 from gsstream.packet.symbols import decode_symbols, encode_symbols
 

@@ -109,8 +109,7 @@ class GateSampler(Part):
 
     @abstractmethod
     def bound(self, logits: torch.Tensor) -> torch.Tensor:
-        """Return the logits projected into the bounds that the part keeps them in; say in its settings which they are.
-        """
+        """Return the logits projected into the part's bounds, which its settings name."""
 
     def form(self) -> AnalyticGate | SampledGate:
         """Return the closed form of this gate as it is configured, where it is that of :class:`AnalyticGate`.

@@ -39,9 +39,13 @@ class CopySettings(PartConfig):
 
 
 def replace_with_copies(
-    scene: Scene, removed: IntArray, work: FitContext, settings: CopySettings, rng: Rng,
+    scene: Scene,
+    removed: IntArray,
+    work: FitContext,
+    settings: CopySettings,
+    rng: Rng,
     admitted: CopyFilter | None = None,
-) -> RowEdit:  # fmt: skip
+) -> RowEdit:
     """Return the change of rows in which some are removed and the frame's copies are added, each a node of its own.
 
     Arguments:
@@ -60,9 +64,12 @@ def replace_with_copies(
 
 
 def fit_copies(
-    scene: Gaussians[torch.Tensor], work: FitContext, settings: CopySettings, rng: Rng,
+    scene: Gaussians[torch.Tensor],
+    work: FitContext,
+    settings: CopySettings,
+    rng: Rng,
     admitted: CopyFilter | None = None,
-) -> Gaussians[torch.Tensor]:  # fmt: skip
+) -> Gaussians[torch.Tensor]:
     """Return the Gaussians that a frame adds to a scene, raw values, at the places that ``admitted`` lets pass.
 
     The scene is that after the frame's motions and without rows that leave; the passes are spread over the rounds.

@@ -30,9 +30,13 @@ def concat_gaussians(scene: Gaussians[Array], added: Gaussians[Array]) -> Gaussi
 
 
 def fit_added(
-    scene: Gaussians[torch.Tensor], added: Gaussians[torch.Tensor], work: FitContext, views: Sequence[int], epochs: int,
+    scene: Gaussians[torch.Tensor],
+    added: Gaussians[torch.Tensor],
+    work: FitContext,
+    views: Sequence[int],
+    epochs: int,
     rng: Rng,
-) -> Gaussians[torch.Tensor]:  # fmt: skip
+) -> Gaussians[torch.Tensor]:
     """Return the newborn, optimised in these views while the scene holds still.
 
     Arguments:

@@ -14,9 +14,14 @@ from gsstream.parts.motion.groups import groups_of_rows
 
 
 def approximate_by_cells(
-    scene: Scene, rows: IntArray, shell: torch.Tensor, translation: FloatArray, rotation: FloatArray, side: float,
+    scene: Scene,
+    rows: IntArray,
+    shell: torch.Tensor,
+    translation: FloatArray,
+    rotation: FloatArray,
+    side: float,
     step: float,
-) -> Motion | None:  # fmt: skip
+) -> Motion | None:
     """Return the rigid motions of small cells that come nearest to a field; None where no cell moves.
 
     A cell moves when at least half of its Gaussians may and none is in the shell: by the mean of their shifts and
@@ -72,10 +77,13 @@ def transform_rows(
     quat = torch.nn.functional.normalize(torch.cat([torch.ones_like(rotation[:, :1]), rotation], 1), dim=1)
     w0, x0, y0, z0 = quat.unbind(1)
     w1, x1, y1, z1 = gaussians.quats.unbind(1)
-    quats = torch.stack([
-        w0 * w1 - x0 * x1 - y0 * y1 - z0 * z1,
-        w0 * x1 + x0 * w1 + y0 * z1 - z0 * y1,
-        w0 * y1 - x0 * z1 + y0 * w1 + z0 * x1,
-        w0 * z1 + x0 * y1 - y0 * x1 + z0 * w1,
-    ], 1)  # fmt: skip
+    quats = torch.stack(
+        [
+            w0 * w1 - x0 * x1 - y0 * y1 - z0 * z1,
+            w0 * x1 + x0 * w1 + y0 * z1 - z0 * y1,
+            w0 * y1 - x0 * z1 + y0 * w1 + z0 * x1,
+            w0 * z1 + x0 * y1 - y0 * x1 + z0 * w1,
+        ],
+        1,
+    )
     return replace(gaussians, means=gaussians.means + translation, quats=quats)

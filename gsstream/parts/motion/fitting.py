@@ -60,9 +60,14 @@ def found_transforms(values: torch.Tensor) -> FloatArray:
 
 
 def fit_transforms_adam(
-    work: FitContext, start: GroupTransforms[FloatArray], unit: FloatArray, rates: Sequence[float],
-    order: np.random.Generator, measure: Measure, l1_weight: float = 0.0,
-) -> FloatArray:  # fmt: skip
+    work: FitContext,
+    start: GroupTransforms[FloatArray],
+    unit: FloatArray,
+    rates: Sequence[float],
+    order: np.random.Generator,
+    measure: Measure,
+    l1_weight: float = 0.0,
+) -> FloatArray:
     """Return the shifts and turns [K, 6] of groups that explain the images best.
 
     Arguments:

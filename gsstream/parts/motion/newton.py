@@ -127,9 +127,14 @@ def _shortening(longest: torch.Tensor, most: float) -> torch.Tensor:
 
 
 def fit_transforms_newton(
-    work: FitContext, start: GroupTransforms[FloatArray], unit: FloatArray, iterations: int,
-    order: np.random.Generator, damping: Damping, settings: BodySettings,
-) -> FloatArray:  # fmt: skip
+    work: FitContext,
+    start: GroupTransforms[FloatArray],
+    unit: FloatArray,
+    iterations: int,
+    order: np.random.Generator,
+    damping: Damping,
+    settings: BodySettings,
+) -> FloatArray:
     """Return the translations and rotations [K, 6] of groups that minimise the loss where the images changed."""
     views, values = len(work.cameras), 3 * work.cameras.height * work.cameras.width
     base, local = narrow_to(work, start)

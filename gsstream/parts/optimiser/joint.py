@@ -76,9 +76,13 @@ class JointGrad(NamedTuple):
 
 
 def joint_vjp(
-    code: JointLayout, upstream: torch.Tensor, change: JointResidual, matrix: torch.Tensor, gates: torch.Tensor,
+    code: JointLayout,
+    upstream: torch.Tensor,
+    change: JointResidual,
+    matrix: torch.Tensor,
+    gates: torch.Tensor,
     units: torch.Tensor,
-) -> JointGrad:  # fmt: skip
+) -> JointGrad:
     """Return the gradient of the map from latents, decoders and gates to features.
 
     Rounding counts as the identity.
@@ -103,9 +107,13 @@ class JointResidualOptimiser(ResidualOptimiser):
     """Calls the functions above, the rate's gradient and the optimiser's ``step``: the reference for faster ones."""
 
     def __init__(
-        self, code: JointLayout, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor,
+        self,
+        code: JointLayout,
+        base: Gaussians[torch.Tensor],
+        units: torch.Tensor,
+        matrix: torch.Tensor,
         optimiser: RowSteps,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._code, self._base, self._units = code, base, units
         self._features = join_features(code, base)
         start = base.means.new_zeros(len(base), code.width)

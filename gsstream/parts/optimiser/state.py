@@ -39,6 +39,9 @@ class RowSteps(Protocol):
     """What makes Adam steps on tables by name: :class:`gsstream.parts.optimiser.base.RowOptimiser`."""
 
     def step(
-        self, values: Mapping[str, torch.Tensor], gradients: Mapping[str, torch.Tensor],
-        states: Mapping[str, AdamState], lrs: Mapping[str, float | torch.Tensor],
-    ) -> None: ...  # fmt: skip
+        self,
+        values: Mapping[str, torch.Tensor],
+        gradients: Mapping[str, torch.Tensor],
+        states: Mapping[str, AdamState],
+        lrs: Mapping[str, float | torch.Tensor],
+    ) -> None: ...

@@ -31,7 +31,6 @@ def rotation_matrices(quats: torch.Tensor) -> torch.Tensor:
     return torch.stack(entries, -1).reshape(-1, 3, 3)
 
 
-
 def quat_multiply_torch(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Return the Hamilton products [n, 4] of quaternions, wxyz."""
     w, v, x, u = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]

@@ -170,9 +170,15 @@ def footprint_in_image(gaussians: Gaussians[torch.Tensor], cameras: Cameras, vie
 
 
 def composite(
-    means2d: torch.Tensor, conics: torch.Tensor, colors: torch.Tensor, opacities: torch.Tensor,
-    start: int, stop: int, width: int, background: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+    means2d: torch.Tensor,
+    conics: torch.Tensor,
+    colors: torch.Tensor,
+    opacities: torch.Tensor,
+    start: int,
+    stop: int,
+    width: int,
+    background: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Composite depth-sorted splats front to back over some image rows; return image and alpha."""
     dtype = means2d.dtype
     ys, xs = torch.meshgrid(
@@ -201,15 +207,21 @@ def evaluate_sh(sh0: torch.Tensor, shN: torch.Tensor, directions: torch.Tensor) 
         basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
     if bases > 4:
         basis += [
-            1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * z * z - x * x - y * y),
-            -1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y),
-        ]  # fmt: skip
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * z * z - x * x - y * y),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (x * x - y * y),
+        ]
     if bases > 9:
         basis += [
-            -0.5900435899266435 * y * (3 * x * x - y * y), 2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (5 * z * z - 1), 0.3731763325901154 * z * (5 * z * z - 3),
-            -0.4570457994644658 * x * (5 * z * z - 1), 1.445305721320277 * z * (x * x - y * y),
+            -0.5900435899266435 * y * (3 * x * x - y * y),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (5 * z * z - 1),
+            0.3731763325901154 * z * (5 * z * z - 3),
+            -0.4570457994644658 * x * (5 * z * z - 1),
+            1.445305721320277 * z * (x * x - y * y),
             -0.5900435899266435 * x * (x * x - 3 * y * y),
-        ]  # fmt: skip
+        ]
     coefficients = torch.cat([sh0, shN], 1)  # [N, K, 3]
     return torch.clamp_min((torch.stack(basis, -1)[..., None] * coefficients).sum(1) + 0.5, 0.0)

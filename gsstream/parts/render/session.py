@@ -236,9 +236,13 @@ def _compared(
 
 
 def _curvature(
-    session: RenderSession, view: int, target: ViewTarget, transforms: GroupTransforms[torch.Tensor],
-    leaves: Gaussians[torch.Tensor], wanted: torch.Tensor | None,
-) -> torch.Tensor:  # fmt: skip
+    session: RenderSession,
+    view: int,
+    target: ViewTarget,
+    transforms: GroupTransforms[torch.Tensor],
+    leaves: Gaussians[torch.Tensor],
+    wanted: torch.Tensor | None,
+) -> torch.Tensor:
     """[K, 6, 6] of Gauss-Newton, from the share that each row has of a pixel's light."""
     rows = leaves.map(torch.Tensor.detach)
     colour = rows.sh0.clone().requires_grad_()

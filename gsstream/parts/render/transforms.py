@@ -42,9 +42,9 @@ def transform_vjp(leaves: Gaussians[torch.Tensor], transforms: GroupTransforms[t
         w, x, y, z = leaves.quats.detach().double().unbind(1)
         a, b, c, d = leaves.quats.grad.double().unbind(1)
         # A small turn v in front of a quaternion q adds (0, v) q to it.
-        torque += torch.stack([
-            -a * x + b * w - c * z + d * y, -a * y + b * z + c * w - d * x, -a * z - b * y + c * x + d * w
-        ], 1)  # fmt: skip
+        torque += torch.stack(
+            [-a * x + b * w - c * z + d * y, -a * y + b * z + c * w - d * x, -a * z - b * y + c * x + d * w], 1
+        )
     return out.index_add_(0, transforms.group, torch.cat([force, torque], 1))
 
 
@@ -81,10 +81,15 @@ def _on_screen(
     seen = [row[0] * x + row[1] * y + row[2] * z + at for row, at in zip(rotation, offset, strict=True)]
     depth = seen[2].clamp_min(cameras.near_plane)
     by_shift = [
-        torch.stack([float(cameras.Ks[view, i, i]) * (rotation[i][axis] - seen[i] / depth * rotation[2][axis]) / depth
-                     for axis in range(3)], 1)
+        torch.stack(
+            [
+                float(cameras.Ks[view, i, i]) * (rotation[i][axis] - seen[i] / depth * rotation[2][axis]) / depth
+                for axis in range(3)
+            ],
+            1,
+        )
         for i in range(2)
-    ]  # fmt: skip
+    ]
     translation = torch.stack(by_shift, 1)
     arm = means - (transforms.center + transforms.translation)[transforms.group]
     turned = _cross(arm[:, None], translation)

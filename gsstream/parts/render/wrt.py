@@ -127,4 +127,3 @@ class LossAndGrad(Generic[G]):
     curvature: torch.Tensor | None = None
     means2d: torch.Tensor | None = None
     exposure: torch.Tensor | None = None
-

@@ -26,9 +26,11 @@ class Flat(Structure):
 
     class Config(PartConfig):
         resolution: int = Field(
-            default=1024, ge=1, le=65536,
+            default=1024,
+            ge=1,
+            le=65536,
             description="position residuals are measured in (the length named by unit / resolution); 1 to 65536",
-        )  # fmt: skip
+        )
         unit: Literal["points", "rig"] = Field(
             default="points", description="points: diameter of the scene's points; rig: extent of the training cameras"
         )

@@ -33,9 +33,10 @@ class Additive(UpdateRule):
         sh0: DirectCode = Field(default=DirectCode(step=0.02, lr=0.02), description="degree-0 colour coefficients")
         shN: DirectCode = Field(default=DirectCode(step=0.01, lr=0.0005), description="higher colour coefficients")
         every: int = Field(
-            default=1, ge=1,
+            default=1,
+            ge=1,
             description="frames from one residual to the next, which above 1 is of all Gaussians; 1: of what changed",
-        )  # fmt: skip
+        )
 
     def scope(self, frame: int) -> Scope:
         if self.config.every == 1:

@@ -17,9 +17,11 @@ from gsstream.parts.update.base import AttributeCode
 
 
 def joint_layout(
-    codes: Mapping[str, AttributeCode], latents: Mapping[str, torch.Tensor], decoders: Mapping[str, torch.Tensor],
+    codes: Mapping[str, AttributeCode],
+    latents: Mapping[str, torch.Tensor],
+    decoders: Mapping[str, torch.Tensor],
     base: Gaussians[torch.Tensor],
-) -> JointLayout:  # fmt: skip
+) -> JointLayout:
     """Return the columns that attributes have in one table, in the order of ``latents``.
 
     Arguments:
@@ -42,9 +44,7 @@ def joint_layout(
     for name in decoders:
         trained[latent[name], feature[name]] = 1
     rates = trained.new_tensor(decoder_lrs)[:, None]
-    return JointLayout(
-        latent, feature, trained.new_tensor(steps), trained.new_tensor(lrs), rates, trained
-    )
+    return JointLayout(latent, feature, trained.new_tensor(steps), trained.new_tensor(lrs), rates, trained)
 
 
 def _width(value: torch.Tensor) -> int:

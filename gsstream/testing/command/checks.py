@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from gsstream.plugins.catalog import Catalog, Entry
-from gsstream.plugins.commands import command_of
+from gsstream.discovery.catalog import Catalog, Entry
+from gsstream.discovery.commands import command_of
 from gsstream.spec import CommandSpec
 from gsstream.testing.common.checks import imports_torch
 from gsstream.testing.registry import check

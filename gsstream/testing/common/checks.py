@@ -113,7 +113,7 @@ def check_cheap_spec(part: Part | SourceUnderTest) -> None:
     """The plugin that declares the part imports without torch, and its target is this class."""
     cls: Any = part.target if isinstance(part, SourceUnderTest) else type(part)
     target = f"{cls.__module__}:{cls.__name__}"
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.discovery.catalog import load_catalog
 
     entries = load_catalog().entries
     owners = [e.plugin for e in entries.values() if getattr(e.spec, "target", None) == target]
@@ -128,7 +128,7 @@ def _plugin_module(plugin: str) -> str:
     from importlib.metadata import entry_points
 
     points = [point for point in entry_points(group="gsstream") if point.name == plugin]
-    return points[0].module if points else "gsstream.plugins.builtin"
+    return points[0].module if points else "gsstream.discovery.builtin"
 
 
 def imports_torch(module: str) -> str:

@@ -51,9 +51,12 @@ def check_confidence_view_order(part: ConfidenceEstimator) -> None:
     """Shuffling the cameras changes nothing."""
     case = get_case("cloud")
     equal(
-        "shuffled cameras", part.estimate(case.views([2, 0, 1])), part.estimate(case), 1e-4,
+        "shuffled cameras",
+        part.estimate(case.views([2, 0, 1])),
+        part.estimate(case),
+        1e-4,
         "sums over views in another order, amplified by a division by their spread",
-    )  # fmt: skip
+    )
 
 
 @check("confidence", trait="finds_motion")

@@ -98,10 +98,12 @@ def _residual_case() -> tuple[JointLayout, Gaussians[torch.Tensor], torch.Tensor
     shapes = (3,), (4,), (3,), (), (1, 3), (3, 3)
     base = Gaussians(*(torch.randn(300, *shape, generator=g) for shape in shapes))
     codes = {
-        "means": AttributeCode(0.05, 0.1), "scales": AttributeCode(1.0, 0.3, 8, 1e-3),
-        "opacities": AttributeCode(0.2, 0.1), "sh0": AttributeCode(0.5, 0.2, 4, 0.0),
+        "means": AttributeCode(0.05, 0.1),
+        "scales": AttributeCode(1.0, 0.3, 8, 1e-3),
+        "opacities": AttributeCode(0.2, 0.1),
+        "sh0": AttributeCode(0.5, 0.2, 4, 0.0),
         "shN": AttributeCode(1.0, 0.2, 5, 1e-2),
-    }  # fmt: skip
+    }
     latents = {name: torch.zeros(300, code.latent or (3 if name == "means" else 1)) for name, code in codes.items()}
     widths = {"scales": 3, "sh0": 3, "shN": 9}
     decoders = {name: 0.1 * torch.randn(codes[name].latent, width, generator=g) for name, width in widths.items()}
@@ -154,15 +156,21 @@ def check_residual_optimiser_run(part: RowOptimiser) -> None:
         code = joint_layout(codes, latents, {}, base)
         subject = part.residual_optimiser(code, base, torch.full((len(active),), 0.2), code.join_decoders({}))
         gates = TrainedGates(
-            ExampleGate(), ExampleRegularizer(), part, 0.05, torch.ones(case.hierarchy.num_nodes), case.hierarchy,
-            active, torch.Generator().manual_seed(1),
-        )  # fmt: skip
+            ExampleGate(),
+            ExampleRegularizer(),
+            part,
+            0.05,
+            torch.ones(case.hierarchy.num_nodes),
+            case.hierarchy,
+            active,
+            torch.Generator().manual_seed(1),
+        )
         frozen = torch.arange(len(active)) % 4 == 0
         targets = [ViewTarget(loss, loss.prepare(image), 0.2, image) for image in case.now]
         iterations = [
             Iteration(place % views, targets[place % views], frozen if place < 2 else None, 0.9**place)
             for place in range(6)
-        ]  # fmt: skip
+        ]
         epoch = ResidualEpoch(session, iterations, gates, 1e-5)
         made = subject.run(epoch) if body is None else body(subject, epoch)
         assert len(made) == 6, f"run(): expected 6 losses, got {len(made)}"

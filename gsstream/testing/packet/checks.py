@@ -46,9 +46,13 @@ def tiny_key(seed: int = 0, number: int = 40, nodes: int = 12) -> KeyState:
         return rng.normal(size=shape).astype(np.float32)
 
     scene = Gaussians(
-        normal(number, 3), normal(number, 4), normal(number, 3) - 3, normal(number), normal(number, 1, 3),
+        normal(number, 3),
+        normal(number, 4),
+        normal(number, 3) - 3,
+        normal(number),
+        normal(number, 1, 3),
         normal(number, 3, 3),
-    )  # fmt: skip
+    )
     counts = np.bincount(rng.integers(0, nodes, number), minlength=nodes).astype(np.int32)
     layout = Layout(counts, rng.integers(0, 3, number).astype(np.uint8), np.array([1.0, 0.3, 0.1], np.float32))
     K = np.array([[50.0, 0, 16], [0, 51.0, 12], [0, 0, 1]])

@@ -12,13 +12,13 @@ import torch
 from gsstream.core.changes.motion import GroupTransforms
 from gsstream.core.errors import ComponentError, ShapeError
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
+from gsstream.discovery.catalog import load_catalog
 from gsstream.parts.loss.base import Loss
 from gsstream.parts.loss.photometric import ReferenceLoss
 from gsstream.parts.render.base import TILE, Renderer, RenderSession
 from gsstream.parts.render.exposure import CameraExposure
 from gsstream.parts.render.target import ViewTarget
 from gsstream.parts.render.wrt import LossAndGrad, Wrt, WrtRows, WrtScene, WrtTransforms
-from gsstream.plugins.catalog import load_catalog
 from gsstream.testing.cases import SIZE, Scene, fingerprint, get_case
 from gsstream.testing.compare import EXACT, at_most, equal, gradients_equal, relative
 from gsstream.testing.registry import check

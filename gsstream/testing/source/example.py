@@ -43,8 +43,7 @@ class ExampleSource:
         return Frame(index, index / self.info.fps, images, cameras)
 
     def points(self, kind: str = "recording") -> PointCloud | None:
-        """Return points of frame 0, or None where the recording has none: then they are found in the training images.
-        """
+        """Return points of frame 0; None where the recording has none: they are then found in the training images."""
         xyz = np.random.default_rng(0).uniform((-0.3, -0.3, 1.7), (0.3, 0.3, 2.3), (50, 3))
         return PointCloud(xyz.astype(np.float32), np.full((50, 3), 0.5, np.float32), "square")
 

@@ -173,7 +173,7 @@ def _sorted_rows(gaussians: Gaussians[FloatArray]) -> FloatArray:
 @check("method", kinds=("method", "streaming_method"))
 def check_method_meta(method: MethodUnderTest) -> None:
     """The key packet names the method and carries the recipe and the cameras of the run."""
-    meta, recipe = method.steps[0].state.player.meta, method.parts.recipe
+    meta, recipe = method.steps[0].state.player.meta, method.assembly.recipe
     assert meta.method == recipe.method, f"method: expected {recipe.method!r}, got {meta.method!r}"
     assert meta.recipe == recipe.model_dump(mode="json"), "the recipe in the key packet is not the one of the run"
     info = open_source(SOURCE).info

@@ -84,9 +84,12 @@ def check_update_closed_loop(part: UpdateRule) -> None:
     rows = sent_rows(layout, level.numpy())
     integers: Mapping[str, torch.Tensor] = quantise_latents(codes, latents)
     residual = Residual(
-        level.numpy().astype(np.uint8), LEVELS, {name: value.numpy()[rows] for name, value in integers.items()},
-        {name: codes[name].step for name in integers}, sent,
-    )  # fmt: skip
+        level.numpy().astype(np.uint8),
+        LEVELS,
+        {name: value.numpy()[rows] for name, value in integers.items()},
+        {name: codes[name].step for name in integers},
+        sent,
+    )
     played = apply_residual(case.gaussians.map(lambda t: t.numpy()), layout, residual)
     assert fingerprint(case.gaussians) == before, "the scene before was changed in place"
     for name, value in played.items():

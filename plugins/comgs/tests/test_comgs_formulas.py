@@ -21,9 +21,12 @@ def points(number: int) -> KeyPoints:
         return torch.from_numpy(RNG.normal(0, scale, shape))
 
     return KeyPoints(
-        draw(number, 3), draw(number, 3, scale=0.1), draw(number, 3, scale=0.2), draw(number, 3, scale=0.3),
+        draw(number, 3),
+        draw(number, 3, scale=0.1),
+        draw(number, 3, scale=0.2),
+        draw(number, 3, scale=0.3),
         draw(number, 4),
-    )  # fmt: skip
+    )
 
 
 def turned(turn: np.ndarray) -> Rotation:

@@ -202,10 +202,17 @@ def _wide_with_moves() -> tuple[RenderSession, WrtTransforms]:
     return session, WrtTransforms(rows, moves()._replace(rows=torch.arange(count), group=torch.arange(count) % 2))
 
 
-@pytest.mark.parametrize(("ask", "change"), [
-    (WRT["rows"], other_loss), (WRT["transforms"], other_loss), (WRT["scene"], other_loss), (WRT["scene"], weighted),
-    (lambda: (wide()[0], WrtRows(wide()[1])), lambda wanted: wanted), (_wide_with_moves, lambda wanted: wanted),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("ask", "change"),
+    [
+        (WRT["rows"], other_loss),
+        (WRT["transforms"], other_loss),
+        (WRT["scene"], other_loss),
+        (WRT["scene"], weighted),
+        (lambda: (wide()[0], WrtRows(wide()[1])), lambda wanted: wanted),
+        (_wide_with_moves, lambda wanted: wanted),
+    ],
+)
 def test_what_the_fused_body_cannot_do_the_default_one_does(ask: Any, change: Any) -> None:
     """Other losses, tiles that weigh in a whole scene, and rows or transforms of a session that was not narrowed."""
     wanted = change(comparison())

@@ -105,8 +105,9 @@ def test_an_active_gradient_is_near_that_of_the_whole_scene(seed: int, dssim: fl
     whole, active, session = begun(seed, g)
     for step in range(5):
         rows = moved(whole.rows(active), 0.02, 0.1 * step, g)
-        found, (loss, gradients) = fused(session, 0, rows, comparison(dssim)), step_by_step(
-            opened(whole, active), rows, comparison(dssim), 0
+        found, (loss, gradients) = (
+            fused(session, 0, rows, comparison(dssim)),
+            step_by_step(opened(whole, active), rows, comparison(dssim), 0),
         )
         assert float(found.loss) == pytest.approx(loss, rel=1e-4)
         assert_near(found.grad, gradients)

@@ -12,6 +12,7 @@ import torch
 from gsstream_cpu_render.residual import CpuResidualOptimiser
 
 from gsstream.core.errors import ComponentError
+from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.budget.schedule import Schedule
 from gsstream.engine.frame0.points import gather_points
@@ -23,14 +24,15 @@ from gsstream.input.recordings.open import open_source
 from gsstream.parts.gate.always_open import AlwaysOpen
 from gsstream.parts.regularizer.base import AnalyticPenalty
 from gsstream.parts.render.base import TILE
-from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 
 SOURCE = "synthetic:frames=3&views=3&width=64&height=48&supersample=1"
 TINY = (
-    "first_frame.max_iterations=20", "first_frame.points=recording", "first_frame.max_points=400",
+    "first_frame.max_iterations=20",
+    "first_frame.points=recording",
+    "first_frame.max_points=400",
     "stream.epochs=2",
-)  # fmt: skip
+)
 #: What takes part in the iterations of each, beside images, residuals, gates, their price and Adam.
 CASES = {
     "edge: rates, rows that leave": ("s2gs-edge", ()),
@@ -57,15 +59,14 @@ def captured(method: str, settings: tuple[str, ...]) -> tuple[Assembly, Problem]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(frame_step, "optimise", noted)
-        encoder = Encoder(
-            parts, source.info, lambda frame: gather_points(source, frame, parts.recipe.first_frame)
-        )
+        encoder = Encoder(parts, source.info, lambda frame: gather_points(source, frame, parts.recipe.first_frame))
         for index in range(3):
             encoder.encode(source.frame(index))
     problem = found[-1]
     # The run has committed the session of this frame since.
-    session = parts.renderer.open(encoder.state.player.scene.gaussians.map(torch.from_numpy), None,
-                                  source.frame(2).cameras, parts.background)  # fmt: skip
+    session = parts.renderer.open(
+        encoder.state.player.scene.gaussians.map(torch.from_numpy), None, source.frame(2).cameras, parts.background
+    )
     session.narrow(problem.rows)
     return parts, replace(problem, session=session)
 

@@ -107,9 +107,13 @@ class Sessions(RuleBasedStateMachine):
     """A session, the scene that it should have, and what it promised before."""
 
     @initialize(
-        kind=st.sampled_from(sorted(KINDS)), budget=st.sampled_from(BUDGETS), seed=SEEDS, threads=st.integers(1, 3),
-        isa=st.sampled_from(_native.supported_isas()), drawn=FLAGS,
-    )  # fmt: skip
+        kind=st.sampled_from(sorted(KINDS)),
+        budget=st.sampled_from(BUDGETS),
+        seed=SEEDS,
+        threads=st.integers(1, 3),
+        isa=st.sampled_from(_native.supported_isas()),
+        drawn=FLAGS,
+    )
     def begin(self, kind: str, budget: float | None, seed: int, threads: int, isa: str, drawn: bool) -> None:
         set_num_threads(threads)
         _native.select_isa(isa)

@@ -8,18 +8,21 @@ from typing import Any
 import pytest
 from gsstream_cpu_render import _native, native
 
+from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.encoder import Encoder
 from gsstream.input.recordings.open import open_source
-from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 
 SOURCE = "synthetic:frames=3&views=3&width=64&height=48&supersample=1"
 SETTINGS = (
-    "first_frame.max_iterations=6", "first_frame.points=recording", "first_frame.max_points=400",
-    "stream.epochs=2", "stream.change_threshold=12",
-)  # fmt: skip
+    "first_frame.max_iterations=6",
+    "first_frame.points=recording",
+    "first_frame.max_points=400",
+    "stream.epochs=2",
+    "stream.change_threshold=12",
+)
 
 
 @pytest.mark.parametrize("method", ["s2gs-edge", "s2gs-paper"])
@@ -47,9 +50,7 @@ def test_every_frame_takes_the_short_cut_unless_each_step_is_checked(
     catalog = load_catalog()
     resolved = resolve_recipe(method, catalog.recipe_path, (), [("the test", text) for text in SETTINGS])
     parts, source = assemble(resolved, catalog, level), open_source(SOURCE)
-    encoder = Encoder(
-        parts, source.info, lambda frame: gather_points(source, frame, parts.recipe.first_frame)
-    )
+    encoder = Encoder(parts, source.info, lambda frame: gather_points(source, frame, parts.recipe.first_frame))
     for index in range(3):
         encoder.encode(source.frame(index))
     assert set(calls) == ({0, 1, 2} if short else set())

@@ -87,9 +87,13 @@ def test_neither_colour_nor_symmetry_nor_clamped_alpha_hides_a_row() -> None:
     K = np.array([[50.0, 0, 24.5], [0, 50.0, 24.5], [0, 0, 1]])
     cameras = Cameras(("a",), viewmat[None], K[None], *size)
     one = Gaussians(
-        torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), -9.0), torch.full((1,), 14.0),
-        torch.full((1, 1, 3), -3.0), torch.zeros(1, 0, 3),
-    )  # fmt: skip
+        torch.zeros(1, 3),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.full((1, 3), -9.0),
+        torch.full((1,), 14.0),
+        torch.full((1, 1, 3), -3.0),
+        torch.zeros(1, 0, 3),
+    )
     for renderer in (CpuRenderer(), ReferenceRenderer()):
         session = renderer.open(one, None, cameras, (0.0, 0.0, 0.0))
         assert not bool((session.screen_gradient(0, torch.ones(32, 32, 3)).gradient != 0).any())
@@ -102,10 +106,13 @@ def test_what_lies_behind_a_wall_is_not_visible() -> None:
     n = 4
     depths = torch.tensor([-1.0, -0.9, -0.8, 0.5])
     whole = Gaussians(
-        torch.stack([torch.zeros(n), torch.zeros(n), depths], 1), torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
-        torch.tensor([[2.0, 2.0, -6.0]] * 3 + [[-3.0] * 3]), torch.full((n,), 6.0), torch.zeros(n, 1, 3),
+        torch.stack([torch.zeros(n), torch.zeros(n), depths], 1),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        torch.tensor([[2.0, 2.0, -6.0]] * 3 + [[-3.0] * 3]),
+        torch.full((n,), 6.0),
+        torch.zeros(n, 1, 3),
         torch.zeros(n, 0, 3),
-    )  # fmt: skip
+    )
     for each in (opened(whole), differentiated(whole)):
         assert each.visible(0, masks(EVEN)[0]).tolist()[3] is False
         assert each.visible(0, masks(EVEN)[0]).tolist()[0] is True

@@ -1,6 +1,5 @@
 """The thread pool under load, and the environment variable that sizes it."""
 
-
 from __future__ import annotations
 
 import multiprocessing
@@ -115,6 +114,7 @@ def test_peaks_are_positive_and_their_arguments_checked() -> None:
     for call in (lambda: fma_peak(0, 0.01), lambda: fma_peak(1, 0.0), lambda: copy_peak(1, 0.0)):
         with pytest.raises(InputError, match="expected"):
             call()
+
 
 #: One tile of 16 x 16 pixels of 4 x 3.
 MASK = np.zeros((3, 4), bool)

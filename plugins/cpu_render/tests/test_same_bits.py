@@ -40,6 +40,7 @@ def rasterised() -> list[Any]:
 
 def whole_scene() -> list[Any]:
     """Twice, with a smaller scene in between."""
+
     def fused(rows: Gaussians[torch.Tensor], coloured: bool) -> list[torch.Tensor]:
         session = CpuRenderer().open(rows, None, rig(), BACKGROUND)
         return list(values(session.loss_and_grad(VIEW, comparison(coloured), WrtScene(rows))).values())

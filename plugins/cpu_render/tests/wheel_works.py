@@ -17,9 +17,13 @@ def main() -> None:
     rng = np.random.default_rng(0)
     number, size = 500, (64, 48)
     scene = (
-        rng.uniform(-1, 1, (number, 3)), rng.normal(size=(number, 4)), rng.uniform(-4, -2, (number, 3)),
-        rng.normal(size=number), rng.normal(size=(number, 1, 3)), rng.normal(size=(number, 8, 3)) * 0.1,
-    )  # fmt: skip
+        rng.uniform(-1, 1, (number, 3)),
+        rng.normal(size=(number, 4)),
+        rng.uniform(-4, -2, (number, 3)),
+        rng.normal(size=number),
+        rng.normal(size=(number, 1, 3)),
+        rng.normal(size=(number, 8, 3)) * 0.1,
+    )
     viewmat = np.eye(4, dtype=np.float32)
     viewmat[2, 3] = 4
     intrinsics = np.array([[60, 0, 32], [0, 60, 24], [0, 0, 1]], np.float32)

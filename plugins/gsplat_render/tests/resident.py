@@ -46,7 +46,7 @@ def method_on(device: torch.device, name: str = "s2gs-fast") -> MethodUnderTest:
     """Return a method of the contract kit's size whose renderer works on a device."""
     under = MethodUnderTest(name)
     renderer = StandIn(StandIn.Config(place=str(device)))
-    under.parts = replace(under.parts, renderer=renderer, loss=ReferenceLoss(), optimiser=ReferenceAdam())
+    under.assembly = replace(under.assembly, renderer=renderer, loss=ReferenceLoss(), optimiser=ReferenceAdam())
     return under
 
 

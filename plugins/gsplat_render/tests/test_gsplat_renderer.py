@@ -148,9 +148,9 @@ def test_visible_in_tiles_agrees_with_the_reference(backend: Backend) -> None:
 def test_a_session_of_some_rows_equals_the_whole_scene(backend: Backend) -> None:
     base, moved = scene(), scene(seed=1)
     active = torch.tensor([90, 3, 40, 41])
-    whole = Gaussians(
-        **{n: v.index_copy(0, active, dict(moved.items())[n][active]) for n, v in base.items()}
-    ).map(torch.Tensor.requires_grad_)
+    whole = Gaussians(**{n: v.index_copy(0, active, dict(moved.items())[n][active]) for n, v in base.items()}).map(
+        torch.Tensor.requires_grad_
+    )
     rows, probe = leaves(moved.rows(active)), torch.zeros(4, 2, requires_grad=True)
     got = open_session(backend, base, active).render(0, rows, probe=probe)
     want = open_session(backend, whole).render(0, whole)

@@ -24,9 +24,12 @@ from torch_kernels import TORCH_KERNELS
 from gsstream.api import PluginUnavailable
 
 NAMES = {
-    "project": "fully_fused_projection", "harmonics": "spherical_harmonics", "tiles": "isect_tiles",
-    "offsets": "isect_offset_encode", "rasterize": "rasterize_to_pixels",
-}  # fmt: skip
+    "project": "fully_fused_projection",
+    "harmonics": "spherical_harmonics",
+    "tiles": "isect_tiles",
+    "offsets": "isect_offset_encode",
+    "rasterize": "rasterize_to_pixels",
+}
 
 
 @pytest.fixture

@@ -81,8 +81,10 @@ def packets_of(frames: list[Frame], device: torch.device = CPU, name: str = "s2g
 def test_an_iteration_of_frame_0_crosses_nothing(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
     """Between two densifications. What is made once for a view is made in the first passes."""
     views, method = len(frames[0].cameras), method_on(DEVICE)
-    settings = method.parts.recipe.first_frame.model_copy(update={"max_iterations": 6 * views})
-    method.parts = replace(method.parts, recipe=method.parts.recipe.model_copy(update={"first_frame": settings}))
+    settings = method.assembly.recipe.first_frame.model_copy(update={"max_iterations": 6 * views})
+    method.assembly = replace(
+        method.assembly, recipe=method.assembly.recipe.model_copy(update={"first_frame": settings})
+    )
     with PretendDevice() as log:
         marks = counted(log, FirstFrameRun, "step", monkeypatch)
         method.begin(frames[0])

@@ -16,10 +16,23 @@ NAN = float("nan")
 
 
 def project(
-    means: torch.Tensor, covars: None, quats: torch.Tensor, scales: torch.Tensor, viewmats: torch.Tensor,
-    Ks: torch.Tensor, width: int, height: int, *, eps2d: float, near_plane: float, far_plane: float,
-    radius_clip: float, packed: bool, calc_compensations: bool, opacities: torch.Tensor,
-) -> tuple[Any, ...]:  # fmt: skip
+    means: torch.Tensor,
+    covars: None,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    viewmats: torch.Tensor,
+    Ks: torch.Tensor,
+    width: int,
+    height: int,
+    *,
+    eps2d: float,
+    near_plane: float,
+    far_plane: float,
+    radius_clip: float,
+    packed: bool,
+    calc_compensations: bool,
+    opacities: torch.Tensor,
+) -> tuple[Any, ...]:
     assert (covars, packed, calc_compensations, radius_clip) == (None, False, False, 0.0)
     whole, _ = gsplat._quat_scale_to_covar_preci(quats, scales, True, False, triu=False)
     radii, means2d, depths, conics, _ = gsplat._fully_fused_projection(
@@ -48,9 +61,16 @@ def harmonics(
 
 
 def tiles(
-    means2d: torch.Tensor, radii: torch.Tensor, depths: torch.Tensor, tile_size: int, columns: int, rows: int, *,
-    packed: bool, n_images: int,
-) -> tuple[torch.Tensor, ...]:  # fmt: skip
+    means2d: torch.Tensor,
+    radii: torch.Tensor,
+    depths: torch.Tensor,
+    tile_size: int,
+    columns: int,
+    rows: int,
+    *,
+    packed: bool,
+    n_images: int,
+) -> tuple[torch.Tensor, ...]:
     assert (packed, n_images) == (False, 1)
     seen, nothing = (radii > 0).all(-1), torch.zeros(())
     means2d, depths = means2d.detach().where(seen[..., None], nothing), depths.detach().where(seen, nothing)
@@ -64,10 +84,20 @@ def offsets(keys: torch.Tensor, n_images: int, columns: int, rows: int) -> torch
 
 
 def rasterize(
-    means2d: torch.Tensor, conics: torch.Tensor, colors: torch.Tensor, opacities: torch.Tensor, width: int,
-    height: int, tile_size: int, starts: torch.Tensor, order: torch.Tensor, *, backgrounds: torch.Tensor,
-    masks: torch.Tensor | None, packed: bool,
-) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+    means2d: torch.Tensor,
+    conics: torch.Tensor,
+    colors: torch.Tensor,
+    opacities: torch.Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    starts: torch.Tensor,
+    order: torch.Tensor,
+    *,
+    backgrounds: torch.Tensor,
+    masks: torch.Tensor | None,
+    packed: bool,
+) -> tuple[torch.Tensor, torch.Tensor]:
     assert not packed
     rows, columns = starts.shape[-2:]
     bounds = [*starts.flatten().tolist(), len(order)]
@@ -92,9 +122,13 @@ def rasterize(
 
 
 def _tile(
-    means2d: torch.Tensor, conics: torch.Tensor, colors: torch.Tensor, opacities: torch.Tensor,
-    corner: tuple[int, int], size: tuple[int, int],
-) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+    means2d: torch.Tensor,
+    conics: torch.Tensor,
+    colors: torch.Tensor,
+    opacities: torch.Tensor,
+    corner: tuple[int, int],
+    size: tuple[int, int],
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Light [h, w, 3] and transmittance [h, w] of one tile, front to back."""
     tall, wide = size
     dx = means2d[:, 0, None, None] - (torch.arange(wide) + corner[0] + 0.5)

@@ -9,7 +9,7 @@ import pytest
 from gsstream_lab.sweep.config import read_sweep
 from gsstream_lab.sweep.plan import Plan, make_plan
 
-from gsstream.plugins.catalog import load_catalog
+from gsstream.discovery.catalog import load_catalog
 
 
 @pytest.fixture

@@ -91,7 +91,7 @@ if __name__ == "__main__":
     from gsstream_lab.sweep.drive import run_sweep
     from gsstream_lab.sweep.plan import make_plan
 
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.discovery.catalog import load_catalog
 
     config = Path(sys.argv[1])
     plan = make_plan(read_sweep(config), config.parent, load_catalog().recipe_path)

@@ -18,8 +18,8 @@ from PIL import Image
 
 from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError, RecipeError
+from gsstream.discovery.catalog import load_catalog
 from gsstream.player.playback import Playback
-from gsstream.plugins.catalog import load_catalog
 
 SOURCE = "synthetic:frames=3&views=3&width=64&height=48&supersample=1"
 SMALL = [
@@ -89,18 +89,17 @@ def test_equal_epochs_leaves_methods_alone_that_make_none() -> None:
     config = equal_epochs(config, [2, 5], catalog)
     plan = make_plan(config, Path(), catalog.recipe_path)
     assert [(cell.variant, cell.seed, cell.axes.get(EPOCHS)) for cell in plan.points] == [
-        (name, seed, epochs)
-        for seed in (0, 1)
-        for name, epochs in (("hold", None), ("dense", 2), ("dense", 5))
+        (name, seed, epochs) for seed in (0, 1) for name, epochs in (("hold", None), ("dense", 2), ("dense", 5))
     ]
     assert len(plan.firsts) == 2, "one for each seed, whatever the method"
     assert "no passes in hold" in config.description
 
 
 @pytest.mark.parametrize(
-    ("seconds", "epochs"), [([], [20]), ([1.0], [10]), ([1e-9, 1e-8], [1]), ([4.0, 1.0], [40, 10])],
+    ("seconds", "epochs"),
+    [([], [20]), ([1.0], [10]), ([1e-9, 1e-8], [1]), ([4.0, 1.0], [40, 10])],
     ids=["time of the first that makes passes", "half the time", "at least one pass", "a curve"],
-)  # fmt: skip
+)
 def test_equal_time_gives_passes_in_proportion(seconds: list[float], epochs: list[int]) -> None:
     config = equal_time(planned("hold", "dense"), seconds, {"hold": 0.1, "dense": 2.0}, load_catalog())
     assert {variant.name: variant.axes for variant in config.variants} == {"hold": {}, "dense": {EPOCHS: epochs}}
@@ -122,9 +121,16 @@ def test_recipe_files_are_methods_and_names_are_used_once(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     ("source", "name"),
-    [("demo", "demo"), ("n3dv:/data/flame_salmon/", "flame_salmon"), ("/data/pick blocks", "pick-blocks"),
-     (SOURCE, "synthetic"), ("..", "recording"), ("../rec/k.1?missing=refuse", "k.1"), ("/", "recording")],
-)  # fmt: skip
+    [
+        ("demo", "demo"),
+        ("n3dv:/data/flame_salmon/", "flame_salmon"),
+        ("/data/pick blocks", "pick-blocks"),
+        (SOURCE, "synthetic"),
+        ("..", "recording"),
+        ("../rec/k.1?missing=refuse", "k.1"),
+        ("/", "recording"),
+    ],
+)
 def test_recordings_are_called_by_their_last_part(source: str, name: str) -> None:
     assert scene_name(source) == name
 

@@ -49,8 +49,12 @@ def test_frame_0_is_its_own_fresh_reconstruction(run: Path) -> None:
     """The recipe's own frame 0, by seeds of its own images: the same bits as a run whose recording ships no points."""
     data = json.loads((run / "gap.json").read_text())
     assert data["gap"]["0"] == {
-        "psnr": 0.0, "psnr_moving": None, "psnr_changed": None, "psnr_seen": 0.0, "psnr_changed_seen": None,
-    }  # fmt: skip
+        "psnr": 0.0,
+        "psnr_moving": None,
+        "psnr_changed": None,
+        "psnr_seen": 0.0,
+        "psnr_changed_seen": None,
+    }
     with Playback(run / "stream.gss") as stream, Playback(data["files"]["0"]) as alone:
         assert stream.state_at(0).means.tobytes() == alone.state_at(0).means.tobytes()
     table = (run / "gap.txt").read_text().splitlines()
@@ -111,7 +115,7 @@ def test_means_are_over_cameras_first_and_leave_out_what_is_not_defined() -> Non
         GapView(1, "a", 30, math.nan, 20, 31, 21, 31, math.nan, 22, 33, 24),
         GapView(1, "b", 32, 28, 24, 33, 25, 35, 29, 30, 37, 31),
         GapView(2, "a", 10, *[math.nan] * 4, 12, *[math.nan] * 4),
-    )  # fmt: skip
+    )
     gap = Gap(views, {1: Path("x"), 2: Path("y")}, 150)
     assert gap.mean("psnr") == 20.5
     assert gap.mean("gap_psnr") == 2.0

@@ -11,8 +11,8 @@ from gsstream_lab.sweep.config import Scene, read_sweep
 from gsstream_lab.sweep.plan import Cell, make_plan
 
 from gsstream.cli.main import run_command
+from gsstream.discovery.catalog import Catalog, load_catalog
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.plugins.catalog import Catalog, load_catalog
 from gsstream.recipe.load import ResolvedRecipe, recipe_hash, resolve_recipe
 from gsstream.recipe.model import Recipe
 from gsstream.recipe.save import to_yaml
@@ -48,13 +48,21 @@ SAME = [
 #: Tables whose rows have other epochs than the paper's budget of 20.
 OTHER_EPOCHS = {"edge-orin": 6, "edge": 6, "fast": 10}
 TINY = [
-    "first_frame.epochs=2", "first_frame.max_iterations=20",
-    "first_frame.max_points=600", "stream.epochs=1", "frames=2",
-]  # fmt: skip
+    "first_frame.epochs=2",
+    "first_frame.max_iterations=20",
+    "first_frame.max_points=600",
+    "stream.epochs=1",
+    "frames=2",
+]
 CHEAP = [
-    "components 1-dense", "components 4-octree", "structure-sparsity structure", "propagation ft-0.80",
-    "discretisation binary-released", "confidence constant-zero", "first-frame-noise noise-30",
-]  # fmt: skip
+    "components 1-dense",
+    "components 4-octree",
+    "structure-sparsity structure",
+    "propagation ft-0.80",
+    "discretisation binary-released",
+    "confidence constant-zero",
+    "first-frame-noise noise-30",
+]
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +72,7 @@ def catalog() -> Catalog:
 
 @pytest.fixture(scope="module")
 def points(catalog: Catalog) -> dict[str, Cell]:
-    """"table row" -> its run on the demo, with what no recording changes."""
+    """ "table row" -> its run on the demo, with what no recording changes."""
     found = {}
     for table in TABLES:
         config = read_sweep(FOLDER / f"{table}.yaml")
@@ -76,7 +84,7 @@ def points(catalog: Catalog) -> dict[str, Cell]:
 
 @pytest.fixture(scope="module")
 def rows(points: dict[str, Cell]) -> dict[str, ResolvedRecipe]:
-    """"table row" -> its recipe."""
+    """ "table row" -> its recipe."""
     return {name: point.resolved for name, point in points.items()}
 
 

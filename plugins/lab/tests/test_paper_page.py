@@ -10,8 +10,8 @@ import pytest
 from gsstream_lab.sweep.config import read_sweep
 from gsstream_lab.sweep.plan import make_plan
 
+from gsstream.discovery.catalog import Catalog, load_catalog
 from gsstream.engine.assembly.assemble import assemble
-from gsstream.plugins.catalog import Catalog, load_catalog
 from gsstream.recipe.load import recipe_hash, resolve_recipe
 
 ROOT = Path(__file__).parents[3]

@@ -37,10 +37,15 @@ def test_straight_lines_agree_with_the_integral() -> None:
 
 @pytest.mark.parametrize(
     "other",
-    [ANCHOR[:2], [], [(size, quality - 10) for size, quality in ANCHOR],
-     [(size, quality + 2) for size, quality in ANCHOR], [(0.0, 29.0), *ANCHOR]],
+    [
+        ANCHOR[:2],
+        [],
+        [(size, quality - 10) for size, quality in ANCHOR],
+        [(size, quality + 2) for size, quality in ANCHOR],
+        [(0.0, 29.0), *ANCHOR],
+    ],
     ids=["two points", "none", "all worse", "touching at one quality", "no bytes"],
-)  # fmt: skip
+)
 def test_what_cannot_be_compared_is_nan(other: list[tuple[float, float]]) -> None:
     assert math.isnan(bd_rate(ANCHOR, other))
     assert math.isnan(bd_rate(other, ANCHOR))
@@ -48,9 +53,7 @@ def test_what_cannot_be_compared_is_nan(other: list[tuple[float, float]]) -> Non
 
 def cells_of(variant: str, factor: float, weights=(1, 2, 3)):
     qualities = {1: (32.0, 40.0), 2: (31.0, 15.0), 3: (30.0, 5.0)}
-    return [
-        ("a", variant, {"stream.rd_lambda": w}, 0, qualities[w][0], factor * qualities[w][1], 1.0) for w in weights
-    ]
+    return [("a", variant, {"stream.rd_lambda": w}, 0, qualities[w][0], factor * qualities[w][1], 1.0) for w in weights]
 
 
 def test_the_report_has_a_table_and_a_picture_of_each_axis(tmp_path: Path) -> None:

@@ -37,20 +37,47 @@ def make_table(folder: Path, cells, paper=None, failed=(), cpu=1.0) -> Path:
     points += [{"cell": f"f{i}", "scene": "a", "variant": "bad", "axes": {}, "seed": i} for i, _ in enumerate(failed)]
     config = {"name": "made up", "description": "Numbers < by hand", "scenes": [], "paper_tables": paper or {}}
     writer.append("plan", {"config": config, "points": points})
-    facts = {"processor": "none", "processors_usable": 1, "gpu": None, "python": "3", "torch": "2", "code": "c",
-             "distributions": {"gsstream": "0"}}  # fmt: skip
+    facts = {
+        "processor": "none",
+        "processors_usable": 1,
+        "gpu": None,
+        "python": "3",
+        "torch": "2",
+        "code": "c",
+        "distributions": {"gsstream": "0"},
+    }
     writer.append("machine", {"id": "m", "facts": facts})
     for i, (_, _, _, seed, quality, kilobytes, seconds) in enumerate(cells):
         frames = [
-            {"frame": t, "bytes": {"layout": 9000} if t == 0 else {"gates": round(1000 * kilobytes)},
-             "seconds": {"code": seconds}, "cpu_seconds": cpu * seconds, "num_gaussians": 10, "sent_gaussians": 5,
-             "num_gates": 4, "active_gates": 2, "peak_memory_mb": 100.0, "psnr": {"x": quality, "y": quality + 2},
-             "ssim": {"x": 0.9}, "psnr_moving": {"x": quality - 5 if t else None}}
+            {
+                "frame": t,
+                "bytes": {"layout": 9000} if t == 0 else {"gates": round(1000 * kilobytes)},
+                "seconds": {"code": seconds},
+                "cpu_seconds": cpu * seconds,
+                "num_gaussians": 10,
+                "sent_gaussians": 5,
+                "num_gates": 4,
+                "active_gates": 2,
+                "peak_memory_mb": 100.0,
+                "psnr": {"x": quality, "y": quality + 2},
+                "ssim": {"x": 0.9},
+                "psnr_moving": {"x": quality - 5 if t else None},
+            }
             for t in range(3)
-        ]  # fmt: skip
-        row = {"id": f"c{i}", "status": "done", "seed": seed, "machine": "m", "recipe": "r", "workers": 1,
-               "threads": "1", "date": "today", "load_average": 0.5, "ssim_variant": "SSIM of the test",
-               "frames": frames}  # fmt: skip
+        ]
+        row = {
+            "id": f"c{i}",
+            "status": "done",
+            "seed": seed,
+            "machine": "m",
+            "recipe": "r",
+            "workers": 1,
+            "threads": "1",
+            "date": "today",
+            "load_average": 0.5,
+            "ssim_variant": "SSIM of the test",
+            "frames": frames,
+        }
         writer.append("cell", row)
     for i, reason in enumerate(failed):
         writer.append("cell", {"id": f"f{i}", "status": "failed", "error": reason})
@@ -58,10 +85,12 @@ def make_table(folder: Path, cells, paper=None, failed=(), cpu=1.0) -> Path:
 
 
 CELLS = [
-    ("a", "v", BASE, 0, 30.0, 20.0, 1.0), ("a", "v", BASE, 1, 30.2, 20.0, 1.0),
-    ("a", "v", CHANGED, 0, 31.1, 25.0, 2.0), ("a", "w", BASE, 0, 30.15, 10.0, 1.0),
+    ("a", "v", BASE, 0, 30.0, 20.0, 1.0),
+    ("a", "v", BASE, 1, 30.2, 20.0, 1.0),
+    ("a", "v", CHANGED, 0, 31.1, 25.0, 2.0),
+    ("a", "w", BASE, 0, 30.15, 10.0, 1.0),
     ("a", "x", BASE, 0, 29.0, 30.0, 3.0),
-]  # fmt: skip
+]
 
 
 @given(st.lists(st.tuples(FLOATS, FLOATS), max_size=12))

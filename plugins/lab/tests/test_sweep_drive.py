@@ -123,11 +123,13 @@ def start_hanging(tmp_path: Path) -> tuple[subprocess.Popen[str], list[int]]:
     marks.mkdir(exist_ok=True)
     config.write_text(TWO_SEEDS + "first_frame: {share: own}\n")
     process = subprocess.Popen(
-        [sys.executable, sweep_works.__file__, str(config), str(tmp_path / "out")], text=True, stderr=subprocess.PIPE,
+        [sys.executable, sweep_works.__file__, str(config), str(tmp_path / "out")],
+        text=True,
+        stderr=subprocess.PIPE,
         env={**os.environ, "SWEEP_TEST_MARKS": str(marks), "GSSTREAM_LOAD_PLUGINS": "lab"},
         # A job in the background of a shell ignores Ctrl-C, and so would every process that its tests start.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )  # fmt: skip
+    )
     deadline = time.monotonic() + 60
     while len(found := list(marks.glob("pid-*"))) < 2:
         assert time.monotonic() < deadline, "no worker has started"

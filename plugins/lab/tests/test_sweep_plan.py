@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from sweep_works import TWO_SEEDS
 
 from gsstream.core.errors import GsstreamError, RecipeError, UnknownName
-from gsstream.plugins.catalog import load_catalog
+from gsstream.discovery.catalog import load_catalog
 
-SCENE = 'scenes: [{name: a, uri: demo}]\n'
+SCENE = "scenes: [{name: a, uri: demo}]\n"
 
 
 def epochs(plan):
@@ -91,9 +91,14 @@ def test_frame_0_is_shared_exactly_where_it_does_not_vary(plan_of):
     variants = "[{name: v, method: dense}, {name: w, method: dense, set: KEY}]"
     text = f"name: f\n{SCENE}seeds: [0, 1]\nvariants: {variants}\n"
     for key, count in {
-        "{stream.epochs: 3}": 2, "{stream.rd_lambda: 0.3}": 2, "{first_frame.lr_factor: 0.1}": 4,
-        "{structure: other}": 4, "{first_frame.epochs: 3}": 4, "{near: 0.2}": 4, "{scale: 0.5}": 4,
-    }.items():  # fmt: skip
+        "{stream.epochs: 3}": 2,
+        "{stream.rd_lambda: 0.3}": 2,
+        "{first_frame.lr_factor: 0.1}": 4,
+        "{structure: other}": 4,
+        "{first_frame.epochs: 3}": 4,
+        "{near: 0.2}": 4,
+        "{scale: 0.5}": 4,
+    }.items():
         plan = plan_of(text.replace("KEY", key))
         assert len(plan.firsts) == count, key
         assert {run.resolved.recipe.frames for run in plan.firsts.values()} == {1}
@@ -111,19 +116,28 @@ def test_ids_follow_what_decides_a_run_and_nothing_else(plan_of):
     ids = list(plan_of(TWO_SEEDS).cells)
     assert list(plan_of(TWO_SEEDS.replace("name: two", "name: other\ndescription: text")).cells) == ids
     assert list(plan_of(TWO_SEEDS.replace("name: world", "name: planet")).cells) == ids
-    for change in (("frames=2", "frames=3"), ("[1, 2]", "[3, 4]"), ("seeds: [0, 1]", "seeds: [2, 3]"),
-                   ("name: two", "name: two\nmeasure: {fps: true}"),
-                   ("method: dense", "method: dense, set: {near: 0.2}"),
-                   ("name: two", "name: two\nfirst_frame: {share: own}")):  # fmt: skip
+    for change in (
+        ("frames=2", "frames=3"),
+        ("[1, 2]", "[3, 4]"),
+        ("seeds: [0, 1]", "seeds: [2, 3]"),
+        ("name: two", "name: two\nmeasure: {fps: true}"),
+        ("method: dense", "method: dense, set: {near: 0.2}"),
+        ("name: two", "name: two\nfirst_frame: {share: own}"),
+    ):
         assert not set(plan_of(TWO_SEEDS.replace(*change)).cells) & set(ids), change
 
 
 @given(st.floats(1e-6, 1e6), st.floats(1.001, 1e6), st.booleans(), st.booleans(), st.integers(0, 5))
 def test_a_random_search_draws_inside_and_always_the_same(low, factor, log, integer, seed):
     config = SweepConfig(
-        name="r", scenes=[{"name": "a", "uri": "demo"}], variants=[{"name": "v"}], search="random", samples=4,
-        search_seed=seed, axes={"x": Range(low=low, high=low * factor, log=log, integer=integer), "y": [1, 2, 3]},
-    )  # fmt: skip
+        name="r",
+        scenes=[{"name": "a", "uri": "demo"}],
+        variants=[{"name": "v"}],
+        search="random",
+        samples=4,
+        search_seed=seed,
+        axes={"x": Range(low=low, high=low * factor, log=log, integer=integer), "y": [1, 2, 3]},
+    )
     drawn = list(combinations(config, config.variants[0]))
     assert drawn == list(combinations(config, config.variants[0]))
     assert len(drawn) == 4

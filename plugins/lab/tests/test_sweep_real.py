@@ -105,6 +105,8 @@ def test_a_dry_run_shows_the_plan_and_writes_nothing(tmp_path, capsys, monkeypat
 
 HAVE_RAY = importlib.util.find_spec("ray") is not None
 needs_ray = pytest.mark.skipif(not HAVE_RAY, reason="needs Ray (extra: ray)")
+
+
 @pytest.fixture
 def marks(tmp_path, monkeypatch):
     """Where the workers of these tests leave their ids; also on the path of Ray's workers."""

@@ -34,11 +34,16 @@ def row(*frames: tuple[int, float], status: str = "done") -> dict:
     """A table's cell: (bytes, wall seconds) by frame; processor time is twice the wall's."""
     made = [
         {
-            "frame": t, "bytes": {"a": size - 1, "b": 1}, "seconds": {"x": s}, "cpu_seconds": 2 * s,
-            "peak_memory_mb": 300.0, "psnr": {"c": 30.0 + t}, "psnr_moving": {"c": None if t == 1 else 20.0 + t},
+            "frame": t,
+            "bytes": {"a": size - 1, "b": 1},
+            "seconds": {"x": s},
+            "cpu_seconds": 2 * s,
+            "peak_memory_mb": 300.0,
+            "psnr": {"c": 30.0 + t},
+            "psnr_moving": {"c": None if t == 1 else 20.0 + t},
         }
         for t, (size, s) in enumerate(frames)
-    ]  # fmt: skip
+    ]
     return {"status": status, "frames": made, "error": "it broke"}
 
 
@@ -85,8 +90,22 @@ def test_the_best_that_fits_is_chosen() -> None:
 
 def command(out: Path, budget: str, *more: str) -> list[str]:
     sets = [item for setting in TINY for item in ("--set", setting)]
-    return ["tune", "--source", WORLD, "--out", str(out), "--budget", budget, "--method", "s2gs-edge", "--frames", "3",
-            "--quiet", *sets, *more]  # fmt: skip
+    return [
+        "tune",
+        "--source",
+        WORLD,
+        "--out",
+        str(out),
+        "--budget",
+        budget,
+        "--method",
+        "s2gs-edge",
+        "--frames",
+        "3",
+        "--quiet",
+        *sets,
+        *more,
+    ]
 
 
 def test_a_pilot_writes_a_recipe_that_runs_inside_the_budget(
@@ -166,8 +185,20 @@ def test_the_better_setting_is_written_and_test_cameras_have_no_say(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sets = ("structure.resolution=1024", "first_frame.max_points=200")
-    command = ["search", "--source", TINY_WORLD, "--method", "dense", "--out", str(tmp_path), "--workers", "1",
-               "--try", "first_frame.max_iterations=0,40", *(word for s in sets for word in ("--set", s))]  # fmt: skip
+    command = [
+        "search",
+        "--source",
+        TINY_WORLD,
+        "--method",
+        "dense",
+        "--out",
+        str(tmp_path),
+        "--workers",
+        "1",
+        "--try",
+        "first_frame.max_iterations=0,40",
+        *(word for s in sets for word in ("--set", s)),
+    ]
     assert run_command(command) == 0
     said = capsys.readouterr().out
     assert "first_frame.max_iterations: 2000 -> " in said
@@ -182,8 +213,21 @@ def test_the_better_setting_is_written_and_test_cameras_have_no_say(
     made = len(cells)
     assert run_command(command) == 0
     assert len(read_table(tmp_path).cells) == made, "the same command keeps what is there"
-    run = ["run", "--source", TINY_WORLD, "--recipe", str(tmp_path / "found.yaml"), "--out", str(tmp_path / "run"),
-           "--set", "first_frame.max_iterations=2", "--frames", "1", "--quiet", "--no-pictures"]  # fmt: skip
+    run = [
+        "run",
+        "--source",
+        TINY_WORLD,
+        "--recipe",
+        str(tmp_path / "found.yaml"),
+        "--out",
+        str(tmp_path / "run"),
+        "--set",
+        "first_frame.max_iterations=2",
+        "--frames",
+        "1",
+        "--quiet",
+        "--no-pictures",
+    ]
     assert run_command(run) == 0
     assert len(metrics(tmp_path / "run")) == 1
 

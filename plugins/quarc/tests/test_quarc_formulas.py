@@ -28,10 +28,13 @@ class Seen:
     def __init__(self, means: np.ndarray, gradients: list[float], views: int = 7) -> None:
         zeros = torch.zeros(len(means))
         self.gaussians = Gaussians(
-            means=torch.from_numpy(means.astype(np.float32)), quats=zeros[:, None].repeat(1, 4),
-            scales=zeros[:, None].repeat(1, 3), opacities=zeros, sh0=zeros[:, None, None].repeat(1, 1, 3),
+            means=torch.from_numpy(means.astype(np.float32)),
+            quats=zeros[:, None].repeat(1, 4),
+            scales=zeros[:, None].repeat(1, 3),
+            opacities=zeros,
+            sh0=zeros[:, None, None].repeat(1, 1, 3),
             shN=torch.zeros(len(means), 0, 3),
-        )  # fmt: skip
+        )
         self.gradients, self.cameras, self.asked = torch.tensor(gradients), rig(views), []
 
     def image_change(self, view: int) -> torch.Tensor:
@@ -83,7 +86,7 @@ def test_a_gate_that_lets_everything_through_copies_as_many_as_may_be() -> None:
     for name, gate in (("open", {"per_cell": 1000}), ("one", {"per_cell": 1, "pixels": 1e3})):
         settings = ChangeGatedCopies.Config(gradient=1e-7, rounds=2, most=30, prune_opacity=0.0, score=0.0, **gate)
         method = MethodUnderTest("quarc")
-        method.parts = replace(method.parts, growth=ChangeGatedCopies(settings))
+        method.assembly = replace(method.assembly, growth=ChangeGatedCopies(settings))
         found[name] = [step.metrics["added_gaussians"] for step in method.steps[1:]]
     assert found["open"] == [30, 30]
     # Cells this large are the eight octants, each of which takes one in each of two rounds at most.

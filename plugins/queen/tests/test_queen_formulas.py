@@ -150,11 +150,13 @@ class TestBirths:
         draws = torch.randn(9, 3, generator=torch.Generator().manual_seed(7)) * sizes
         for q, v, got in zip(quats, draws, added, strict=True):
             w, x, y, z = (q / q.norm()).tolist()
-            matrix = torch.tensor([
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ])  # fmt: skip
+            matrix = torch.tensor(
+                [
+                    [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                    [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                    [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+                ]
+            )
             torch.testing.assert_close(got, matrix @ v, atol=1e-5, rtol=1e-5)
 
     def test_means_count_only_the_iterations_that_hit(self) -> None:

@@ -19,11 +19,14 @@ from gsstream.player.playback import Playback
 
 SOURCE = "synthetic:frames=5&views=3&width=64&height=48&supersample=1"
 SETTINGS = {
-    "first_frame.max_iterations": 40, "first_frame.max_points": 500, "stream.epochs": 3,
-    "streaming_method.growth.every": 1, "streaming_method.growth.grad_threshold": 1e-4,
+    "first_frame.max_iterations": 40,
+    "first_frame.max_points": 500,
+    "stream.epochs": 3,
+    "streaming_method.growth.every": 1,
+    "streaming_method.growth.grad_threshold": 1e-4,
     "streaming_method.growth.max_added": 30,
     "streaming_method.change.dynamic": 1e-7,
-}  # fmt: skip
+}
 
 
 def encode(out: Path, *more: str, source: str = SOURCE, **changes: Any) -> bytes:

@@ -140,9 +140,9 @@ def test_rounded_motions_are_shown_while_they_are_fitted_and_sent_as_they_are() 
 def test_anchors_stay_with_their_gaussians_and_a_resumed_run_finds_them() -> None:
     method = MethodUnderTest("recon")
     motion = AnchorMotion(Settings(measure="anchor", per_anchor=4, every=2, step=0.001))
-    copies = type(method.parts.part("growth"))
+    copies = type(method.assembly.part("growth"))
     growth = copies(copies.Config(gradient=1e-7, rounds=1, most=7, prune_opacity=0.0))
-    method.parts = replace(method.parts, motion=motion, growth=growth)
+    method.assembly = replace(method.assembly, motion=motion, growth=growth)
     states = [step.state for step in method.steps]
     assert [state.motion_memory and state.motion_memory.drawn for state in states] == [None, 1, 1]
     before, state = states[1:]

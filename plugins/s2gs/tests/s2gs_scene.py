@@ -24,9 +24,7 @@ def gaussians(n: int = 60, seed: int = 0) -> Gaussians[torch.Tensor]:
     return scene(means, seed)
 
 
-def context(
-    blobs: Gaussians[torch.Tensor], cameras: Cameras, before: Images, now: Images, sigma: float = 0.0
-) -> World:
+def context(blobs: Gaussians[torch.Tensor], cameras: Cameras, before: Images, now: Images, sigma: float = 0.0) -> World:
     """What an estimator sees between two sets of images."""
     still = make_case("given images", blobs, cameras.select([]))
     return dataclasses.replace(still, cameras=cameras, before=tuple(before), now=tuple(now), sigma=sigma)

@@ -18,8 +18,8 @@ from s2gs_scene import gaussians
 
 from gsstream.core.changes import Delta, Layout, Residual, Scene, apply_delta
 from gsstream.core.gaussians import Gaussians
+from gsstream.discovery.catalog import load_catalog
 from gsstream.parts.update.base import init_latents
-from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.testing import parametrize_with_checks
 
@@ -44,12 +44,19 @@ class TestLatent:
         scene = gaussians(7)
         latents = init_latents(LatentResidual(), scene)
         assert {n: v.shape[1] for n, v in latents.items()} == {
-            "means": 3, "quats": 6, "scales": 8, "opacities": 1, "sh0": 4
-        }  # fmt: skip
+            "means": 3,
+            "quats": 6,
+            "scales": 8,
+            "opacities": 1,
+            "sh0": 4,
+        }
         decoders = LatentResidual().init_decoders(scene, torch.Generator().manual_seed(0))
         assert {n: tuple(v.shape) for n, v in decoders.items()} == {
-            "quats": (6, 4), "scales": (8, 3), "opacities": (1, 1), "sh0": (4, 3)
-        }  # fmt: skip
+            "quats": (6, 4),
+            "scales": (8, 3),
+            "opacities": (1, 1),
+            "sh0": (4, 3),
+        }
 
     def test_one_number_may_be_changed(self) -> None:
         changed = LatentResidual.Config.model_validate({"sh0": {"lr": 0.05}, "means": {"step": 0.1}})
@@ -87,9 +94,12 @@ class TestLatent:
         ("name", "least", "most"),
         [
             # change of a visible quantity by one symbol: 8-bit grey levels, degrees, relative size, opacity at 0.5
-            ("sh0", 0.2, 10.0), ("quats", 0.1, 5.0), ("scales", 0.002, 0.1), ("opacities", 0.0, 0.1),
+            ("sh0", 0.2, 10.0),
+            ("quats", 0.1, 5.0),
+            ("scales", 0.002, 0.1),
+            ("opacities", 0.0, 0.1),
         ],
-    )  # fmt: skip
+    )
     def test_one_symbol_is_a_small_visible_change(self, name: str, least: float, most: float) -> None:
         scene, rule = gaussians(3), LatentResidual()
         seen = []
@@ -113,6 +123,7 @@ class TestLatent:
                 latent.grad = torch.ones_like(latent)
                 adam.step()
             assert bool((latent.detach().abs() > 0.5).all()), name
+
 
 ROWS = 400
 

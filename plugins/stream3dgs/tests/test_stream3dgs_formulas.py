@@ -132,10 +132,10 @@ def test_only_what_changed_moves_and_nothing_that_was_added() -> None:
 
 def test_what_a_frame_adds_is_there_for_that_frame_alone() -> None:
     method = MethodUnderTest("stream3dgs")
-    copies = type(method.parts.part("growth"))
+    copies = type(method.assembly.part("growth"))
     growth = copies(copies.Config(gradient=1e-7, rounds=1, most=7, prune_opacity=0.0, leave="last-added"))
     small = CacheMotion(CacheMotion.Config(levels=2, entries=6, width=4))
-    method.parts = replace(method.parts, motion=small, growth=growth)
+    method.assembly = replace(method.assembly, motion=small, growth=growth)
     first, second, third = method.steps
     number = len(first.state.player.gaussians)
     assert [step.metrics["added_gaussians"] for step in (second, third)] == [7, 7]

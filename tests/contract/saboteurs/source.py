@@ -108,8 +108,10 @@ class SameIntrinsics(ExampleSource):
 
     def __init__(self, uri: str, scale: float) -> None:
         super().__init__(uri, scale)
-        train, test = (replace(rig, Ks=ExampleSource(uri, 1.0).info.train.Ks[: len(rig)])
-                       for rig in (self.info.train, self.info.test))  # fmt: skip
+        train, test = (
+            replace(rig, Ks=ExampleSource(uri, 1.0).info.train.Ks[: len(rig)])
+            for rig in (self.info.train, self.info.test)
+        )
         self.info = replace(self.info, train=train, test=test)
 
 

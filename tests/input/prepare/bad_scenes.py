@@ -50,10 +50,17 @@ def write_good(folder: Path) -> None:
         for i, name in enumerate(rig.ids):
             (folder / name).mkdir(parents=True)
             w2c, K = rig.viewmats[i].tolist(), rig.Ks[i].tolist()
-            cameras.append({
-                "id": name, "split": split, "width": rig.width, "height": rig.height, "K": K, "w2c": w2c,
-                "frames": f"{name}/%06d.png",
-            })  # fmt: skip
+            cameras.append(
+                {
+                    "id": name,
+                    "split": split,
+                    "width": rig.width,
+                    "height": rig.height,
+                    "K": K,
+                    "w2c": w2c,
+                    "frames": f"{name}/%06d.png",
+                }
+            )
         for t in range(FRAMES):
             for name, image in zip(rig.ids, source.frame(t, split).images, strict=True):
                 save(folder / name / f"{t:06d}.png", image)

@@ -56,6 +56,7 @@ def test_unknown_poses_are_recovered_and_the_test_camera_changes_nothing(tmp_pat
     scene, truth = open_source(str(tmp_path / "scene")).info, open_source(LARGE).info
     assert scene.train.ids == truth.train.ids
     assert scene.test.ids == ("test",)
+
     # Up to a similarity: distances of the centres keep their ratios, the test camera's included.
     def gaps(info):
         centers = np.concatenate([info.train.centers, info.test.centers])
@@ -215,8 +216,15 @@ def declared(raw: Path, world: str = WORLD, edit=lambda entry: None, frames: int
     rig, cameras = open_source(world).info, []
     for split, part in (("train", rig.train), ("test", rig.test)):
         for name, K, w2c in zip(part.ids, part.Ks, part.viewmats, strict=True):
-            entry = {"id": name, "split": split, "width": 240, "height": 180, "K": K.tolist(), "w2c": w2c.tolist(),
-                     "frames": f"{name}/shot%d.png"}  # fmt: skip
+            entry = {
+                "id": name,
+                "split": split,
+                "width": 240,
+                "height": 180,
+                "K": K.tolist(),
+                "w2c": w2c.tolist(),
+                "frames": f"{name}/shot%d.png",
+            }
             edit(entry)
             cameras.append(entry)
     data = {"schema": "opencv-multiview-1", "name": "raw", "fps": 25, "frames": frames, "cameras": cameras}
@@ -286,10 +294,20 @@ def photographs(folder: Path) -> Path:
         folder.mkdir(exist_ok=True)
         save(folder / f"{number:04d}.png", image)
         pose = np.linalg.inv(w2c) @ np.diag([1.0, -1, -1, 1])
-        entries.append({
-            "file_path": f"{number:04d}.png", "transform_matrix": pose.tolist(), "w": image.shape[1], "h": 240,
-            "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "k1": 1e-3, "k3": 1e-3,
-        })  # fmt: skip
+        entries.append(
+            {
+                "file_path": f"{number:04d}.png",
+                "transform_matrix": pose.tolist(),
+                "w": image.shape[1],
+                "h": 240,
+                "fl_x": K[0, 0],
+                "fl_y": K[1, 1],
+                "cx": K[0, 2],
+                "cy": K[1, 2],
+                "k1": 1e-3,
+                "k3": 1e-3,
+            }
+        )
     (folder / "transforms.json").write_text(json.dumps({"frames": entries}))
     return folder
 

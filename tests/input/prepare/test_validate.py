@@ -92,10 +92,13 @@ def test_offsets_of_clocks_are_found_in_both_directions_and_never_made_up() -> N
         return [finding.message.split(":")[0] for finding in check_sync(replace(thumbs, images=images))]
 
     rows = {
-        -3: ["camera 'cam02' is 3 frames late"], -1: ["camera 'cam02' is 1 frame late"], 0: [],
-        1: ["camera 'cam02' is 1 frame early"], 3: ["camera 'cam02' is 3 frames early"],
+        -3: ["camera 'cam02' is 3 frames late"],
+        -1: ["camera 'cam02' is 1 frame late"],
+        0: [],
+        1: ["camera 'cam02' is 1 frame early"],
+        3: ["camera 'cam02' is 3 frames early"],
         4: ["camera 'cam02' is at least 4 frames early"],
-    }  # fmt: skip
+    }
     assert {shift: told(shift) for shift in rows} == rows
     assert told(0, frames=3) == ["clocks"], "three frames are too few to compare clocks, which is said"
     still = replace(thumbs, images=np.repeat(thumbs.images[:1], 12, axis=0))

@@ -233,12 +233,14 @@ def project_panoptic(folder: Path, camera: int, points: Array) -> Array:
 def quaternion(rotation: Array) -> Array:
     """wxyz, by the eigenvector of Bar-Itzhack's matrix: nothing in common with how it is read."""
     (a, b, c), (d, e, f), (g, h, i) = rotation
-    K = np.array([
-        [a - e - i, b + d, c + g, h - f],
-        [b + d, e - a - i, f + h, c - g],
-        [c + g, f + h, i - a - e, d - b],
-        [h - f, c - g, d - b, a + e + i],
-    ])  # fmt: skip
+    K = np.array(
+        [
+            [a - e - i, b + d, c + g, h - f],
+            [b + d, e - a - i, f + h, c - g],
+            [c + g, f + h, i - a - e, d - b],
+            [h - f, c - g, d - b, a + e + i],
+        ]
+    )
     x, y, z, w = np.linalg.eigh(K / 3)[1][:, -1]
     return np.array([w, x, y, z]) * (1 if w > 0 else -1)
 
@@ -246,8 +248,10 @@ def quaternion(rotation: Array) -> Array:
 def tracks(world: World) -> list[list[int]]:
     """Which images see a point: the test image (0) sees every third."""
     cameras = len(world.poses)
-    return [sorted({1 + p % (cameras - 1), 1 + (p + 1) % (cameras - 1)} | ({0} if p % 3 == 0 else set()))
-            for p in range(len(world.xyz))]  # fmt: skip
+    return [
+        sorted({1 + p % (cameras - 1), 1 + (p + 1) % (cameras - 1)} | ({0} if p % 3 == 0 else set()))
+        for p in range(len(world.xyz))
+    ]
 
 
 def observations(world: World) -> list[list[int]]:
@@ -260,9 +264,14 @@ def _track(p: int, track: list[int], seen: list[list[int]]) -> list[tuple[int, i
 
 
 def write_colmap(
-    folder: Path, world: World, *, binary: bool = True, frames: str = "videos", model: str = "PINHOLE",
+    folder: Path,
+    world: World,
+    *,
+    binary: bool = True,
+    frames: str = "videos",
+    model: str = "PINHOLE",
     extra: tuple[float, ...] = (),
-) -> Path:  # fmt: skip
+) -> Path:
     sparse = folder / "sparse" / "0"
     sparse.mkdir(parents=True)
     names = [f"cam{c:02d}.png" for c in range(len(world.poses))]

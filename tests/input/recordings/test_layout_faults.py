@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from scenes import LAYOUTS, SIZE, World, make_world, write_colmap, write_frames, write_n3dv, write_ply, write_png
 
 from gsstream.core.errors import SourceError
+from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.run.recording import open_recording
 from gsstream.input.recordings.open import open_source
 from gsstream.input.recordings.options import DataOptions
 from gsstream.input.recordings.transformed import transformed
-from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 
 ROOT = Path(__file__).parents[3]
@@ -177,8 +177,10 @@ def test_ply_faults_and_kinds(tmp_path: Path, world: World) -> None:
     def points():
         return transformed(open_source(str(folder)), DataOptions(leak="points")).points()
 
-    path.write_text("ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty double y\nproperty double z\n"
-                    "end_header\n1 2 3\n4 5 6\n")  # fmt: skip
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty double y\nproperty double z\n"
+        "end_header\n1 2 3\n4 5 6\n"
+    )
     np.testing.assert_array_equal(points().xyz, [[1, 2, 3], [4, 5, 6]])
     assert (points().rgb == 0.5).all()
     for spoil, message in {
@@ -198,9 +200,7 @@ def test_ply_faults_and_kinds(tmp_path: Path, world: World) -> None:
         points()
 
 
-@pytest.mark.parametrize(
-    ("name", "recipe"), [("n3dv", "n3dv"), ("meetroom", "meetroom"), ("enerf", "enerf_outdoor")]
-)
+@pytest.mark.parametrize(("name", "recipe"), [("n3dv", "n3dv"), ("meetroom", "meetroom"), ("enerf", "enerf_outdoor")])
 def test_data_set_recipes_state_split_size_and_frames(tmp_path: Path, world: World, name: str, recipe: str) -> None:
     catalog = load_catalog()
     file = ROOT / "configs" / "recordings" / f"{recipe}.yaml"

@@ -164,9 +164,10 @@ def test_no_layout_and_several_layouts_are_told_apart(tmp_path: Path, world: Wor
 
 
 TINY = {
-    "first_frame.max_iterations": 12, "first_frame.max_points": 300,
+    "first_frame.max_iterations": 12,
+    "first_frame.max_points": 300,
     "stream.epochs": 1,
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", ["n3dv", "meetroom", "enerf", "panoptic", "colmap text", "nerfstudio timed"])

@@ -90,13 +90,17 @@ def test_cameras_with_other_intrinsics_are_others(tmp_path, world) -> None:
 
 
 FAULTS = {
-    "moving camera": (lambda d: [e["transform_matrix"][0].__setitem__(3, i) for i, e in enumerate(d["frames"])],
-                      "each from another pose: a camera that moves"),
+    "moving camera": (
+        lambda d: [e["transform_matrix"][0].__setitem__(3, i) for i, e in enumerate(d["frames"])],
+        "each from another pose: a camera that moves",
+    ),
     "a time is missing": (lambda d: d["frames"].pop(0), "has no picture of time"),
-    "a time twice": (lambda d: d["frames"][0].update(time=d["frames"][0]["time"] + 0.1),
-                     "two pictures of time|no picture"),
+    "a time twice": (
+        lambda d: d["frames"][0].update(time=d["frames"][0]["time"] + 0.1),
+        "two pictures of time|no picture",
+    ),
     "time is text": (lambda d: d["frames"][0].update(time="now"), "must be a finite number"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -71,9 +71,12 @@ def toml(folder: Path, vector: bool) -> None:
         lines += [
             f"[cam_{number}]" if vector else f"[cameras.{number}]",
             f'name = "cam_{number}"' if vector else f"cam_id = {number}",
-            f"size = [{WIDTH}, {HEIGHT}]", f"matrix = {matrix}", f"distortions = {list(DISTORTION)}",
-            f"rotation = {rotation}", f"translation = {pose[:3, 3].tolist()}",
-        ]  # fmt: skip
+            f"size = [{WIDTH}, {HEIGHT}]",
+            f"matrix = {matrix}",
+            f"distortions = {list(DISTORTION)}",
+            f"rotation = {rotation}",
+            f"translation = {pose[:3, 3].tolist()}",
+        ]
     (folder / "calibration").mkdir()
     (folder / "calibration" / "rig.toml").write_text("\n".join(lines) + "\n")
 
@@ -157,10 +160,14 @@ def reality_csv(folder: Path) -> None:
 
 #: Name -> (writer, whether the format knows one focal length only).
 FORMATS: dict[str, tuple[Callable[[Path], None], bool]] = {
-    "qualisys": (qualisys, False), "anipose": (lambda f: toml(f, True), False),
-    "caliscope": (lambda f: toml(f, False), False), "opencv": (opencv, False), "metashape": (metashape, False),
-    "realitycapture-xmp": (reality_xmp, True), "realitycapture-csv": (reality_csv, True),
-}  # fmt: skip
+    "qualisys": (qualisys, False),
+    "anipose": (lambda f: toml(f, True), False),
+    "caliscope": (lambda f: toml(f, False), False),
+    "opencv": (opencv, False),
+    "metashape": (metashape, False),
+    "realitycapture-xmp": (reality_xmp, True),
+    "realitycapture-csv": (reality_csv, True),
+}
 
 
 def pictures(folder: Path) -> None:
@@ -210,7 +217,7 @@ def spoil(text: str, new: str) -> Callable[[Path], None]:
         ("metashape", spoil("<k1>", "<k4>0.1</k4><k1>"), "k4 and b2"),
         ("realitycapture-xmp", spoil("brown3t2", "division"), "a model of Brown"),
     ],
-)  # fmt: skip
+)
 def test_a_calibration_that_cannot_be_used_is_told_with_the_cure(
     tmp_path: Path, name: str, fault: Callable[[Path], None], message: str
 ) -> None:

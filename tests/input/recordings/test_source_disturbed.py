@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from gsstream.core.errors import EndOfRecording, SourceError
+from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.run.recording import reopen_recording
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
 from gsstream.input.recordings.options import DataOptions, Disturbances
 from gsstream.input.recordings.sync import RecordingWarning
 from gsstream.input.recordings.transformed import TransformedSource, transformed
-from gsstream.plugins.catalog import load_catalog
 
 WORLD = "synthetic:frames=12&views=4&width=16&height=12&supersample=1&motion=3"
 CASES: dict[str, tuple[str, dict[str, Any], int]] = {

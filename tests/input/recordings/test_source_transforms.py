@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from gsstream.core.errors import RecipeError, SourceError
 from gsstream.core.rng import Rng
+from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.run.recording import reopen_recording
 from gsstream.input.recordings.disturbed import DisturbedSource
 from gsstream.input.recordings.open import open_source
@@ -20,7 +21,6 @@ from gsstream.input.recordings.options import DataOptions, Disturbances
 from gsstream.input.recordings.synthetic import SyntheticSource
 from gsstream.input.recordings.transformed import transformed
 from gsstream.input.recordings.transforms import gain_at
-from gsstream.plugins.catalog import load_catalog
 from gsstream.recipe.load import resolve_recipe
 
 WORLD = "synthetic:frames=12&views=4&width=16&height=12&supersample=1&motion=3"

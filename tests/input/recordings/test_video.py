@@ -168,7 +168,7 @@ def test_late_starts_and_unequal_lengths_are_told_with_the_setting_that_mends_th
     text = " | ".join(str(w.message) for w in told)
     assert "cameras differ in their frames (cam00 8 from 0); the 6 common ones are used" in text
     assert "the span is that of cam01" in text, "the short one is named"
-    assert 'frames: cam01 3.0' in text
+    assert "frames: cam01 3.0" in text
     assert "--source disturbed:time_offset=cam01@-3:SOURCE" in text
 
 

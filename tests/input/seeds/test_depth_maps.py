@@ -18,7 +18,7 @@ from rigs import HEIGHT, WIDTH, inwards
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError, SourceError
 from gsstream.encode import to_rig_coordinates
-from gsstream.engine.fit import schedule
+from gsstream.engine.fit import constants
 from gsstream.engine.frame0.points import gather_points
 from gsstream.input.recordings.depth_maps import read_depth_maps
 from gsstream.input.recordings.multiview import read_points
@@ -90,7 +90,7 @@ def write(folder: Path, unit: float = 1.0) -> Path:
 
 
 def test_depth_is_in_the_units_of_the_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(schedule, "PIXELS_PER_SEED", 1)  # the pictures are tiny
+    monkeypatch.setattr(constants, "PIXELS_PER_SEED", 1)  # the pictures are tiny
     found = []
     for unit in (1.0, 1e-3, 0.3048):
         source = to_rig_coordinates(open_source(str(write(tmp_path / f"{unit}", unit))))
@@ -134,9 +134,7 @@ def array(values: np.ndarray) -> Callable[[Path], None]:
         (array(np.zeros((HEIGHT, HEIGHT))), "got 48 x 48"),
     ],
 )
-def test_a_file_that_does_not_fit_is_named(
-    tmp_path: Path, write_it: Callable[[Path], None], message: str
-) -> None:
+def test_a_file_that_does_not_fit_is_named(tmp_path: Path, write_it: Callable[[Path], None], message: str) -> None:
     write_it(tmp_path / "cam0.npy")
     with pytest.raises(SourceError, match=message):
         read_depth_maps(tmp_path, RING)
@@ -149,9 +147,10 @@ def test_points_that_their_maker_does_not_trust_are_left_out(tmp_path: Path) -> 
     np.testing.assert_array_equal(read_points(path, "recording").xyz, xyz[[1, 2]])
     for wrong, message in (
         (np.ones(3), r"expected confidence \[4\] from 0 to 1, got \[3\]"),
-        (np.array([0, 1, 2, 3.0]), "from 0 to 1"), (np.array([np.nan, 1, 1, 1]), "from 0 to 1"),
+        (np.array([0, 1, 2, 3.0]), "from 0 to 1"),
+        (np.array([np.nan, 1, 1, 1]), "from 0 to 1"),
         (np.full(4, 0.1), "below 0.5 for every point"),
-    ):  # fmt: skip
+    ):
         np.savez(path, xyz=xyz, rgb=rgb, confidence=wrong)
         with pytest.raises(SourceError, match=message):
             read_points(path, "recording")

@@ -61,16 +61,26 @@ def photograph(room: Room, cameras: Cameras) -> np.ndarray:
 @pytest.mark.parametrize(
     ("cameras", "around"),
     [
-        (inwards(4, 360), True), (inwards(8, 360), True), (inwards(2, 180), True), (inwards(3, 130), True),
-        (inwards(31, 180, radius=50), True), (DOME, True),
-        (inwards(3, 100), True), (inwards(3, 80), False), (inwards(9, 68), False),
-        (inwards(4, 30), False), (in_line(4), False),
-        (outwards(6), False), (outwards(3), False), (parallel(5), False), (parallel(5, wobble=0.02), False),
+        (inwards(4, 360), True),
+        (inwards(8, 360), True),
+        (inwards(2, 180), True),
+        (inwards(3, 130), True),
+        (inwards(31, 180, radius=50), True),
+        (DOME, True),
+        (inwards(3, 100), True),
+        (inwards(3, 80), False),
+        (inwards(9, 68), False),
+        (inwards(4, 30), False),
+        (in_line(4), False),
+        (outwards(6), False),
+        (outwards(3), False),
+        (parallel(5), False),
+        (parallel(5, wobble=0.02), False),
         (looking([[1, 2, 3]], [[0, 0, 0]]), False),
         # One camera of a ring that looks away sees no room that the others stand in.
         (looking(on_arc(4, 360), [[0, 0, 0]] * 3 + [[0, -9, 0.6]]), False),
     ],
-)  # fmt: skip
+)
 def test_a_rig_stands_around_when_some_pair_faces_each_other(cameras: Cameras, around: bool) -> None:
     assert stands_around(cameras) == around
 

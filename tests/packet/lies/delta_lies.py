@@ -44,10 +44,12 @@ def _residual_lies(packet: EncodedPacket) -> Iterator[tuple[str, str, bytes, str
         yield f"pattern {bits}", "pattern", encode_symbols(pattern), "pattern of a row: expected 0 to 15"
     no_decoder, channels = "is unknown, or its decoder was never sent", "channels without a decoder, got"
     heads = [
-        (2, 3, 0.1, f"mode 2 {no_decoder}"), (1, 3, 0.1, f"mode 1 {no_decoder}"), (0, 0, 0.1, f"{channels} 0"),
+        (2, 3, 0.1, f"mode 2 {no_decoder}"),
+        (1, 3, 0.1, f"mode 1 {no_decoder}"),
+        (0, 0, 0.1, f"{channels} 0"),
         (0, 255, 0.1, f"{channels} 255"),
         *((0, 3, step, f"a positive number below 1e6, got {step}") for step in (0.0, math.nan, math.inf, -1.0)),
-    ]  # fmt: skip
+    ]
     for mode, width, step, message in heads:
         yield f"{width} channels, {mode}, {step}", "means", struct.pack("<BBf", mode, width, step) + means[6:], message
 
@@ -84,7 +86,9 @@ def _row_lies(packet: EncodedPacket) -> Iterator[tuple[str, str, bytes, str]]:
         ("a parent behind all", 1, column(0, 99), "a parent that is no node before its own"),
         ("no node receives", 2, encode_gates(np.zeros(14, np.uint8), 1), "8 bytes for an empty table"),
         ("all nodes receive", 2, encode_gates(np.ones(14, np.uint8), 3), "receive 15 Gaussians, 4 were announced"),
-        ("no nodes", 2, b"", PAST), ("no counts", 3, b"", PAST), ("no means", 5, b"\0\0\0", PAST),
+        ("no nodes", 2, b"", PAST),
+        ("no counts", 3, b"", PAST),
+        ("no means", 5, b"\0\0\0", PAST),
         ("a unit beyond", 4, column(0, 0, 3, 0), "units 0 to 3, the scene has 3"),
         ("a unit below", 4, column(0, 0, -1, 0), "units -1 to 0, the scene has 3"),
         ("no scales", 7, b"", "scales cut short"),

@@ -20,10 +20,14 @@ from gsstream.packet.symbols import encode_symbols
 
 MANY = 0xFFFFFFFF
 METAS = {
-    b"": "Expecting value", b"[]": "list indices", b"{}": "the entry 'method' is missing",
-    b"[" * 100_000: "recursion", b'{"version": NaN}': "NaN is not a number", b"\xff\xfe": "not what was expected",
+    b"": "Expecting value",
+    b"[]": "list indices",
+    b"{}": "the entry 'method' is missing",
+    b"[" * 100_000: "recursion",
+    b'{"version": NaN}': "NaN is not a number",
+    b"\xff\xfe": "not what was expected",
     b"1" * 5000: "Exceeds the limit",
-}  # fmt: skip
+}
 
 
 def key_victim() -> Victim:

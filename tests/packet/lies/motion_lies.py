@@ -64,9 +64,11 @@ def _lying_motions(state: PlayerState, delta: Delta, data: bytes) -> Iterator[tu
     yield "runs beyond the groups", head + pack_blobs([few, b""]), "gate"
     yield "levels", head + pack_blobs([encode_gates(np.full(count, 2, np.uint8), 2), symbols]), "no levels"
     yield "no symbols", head + pack_blobs([gates, b""]), PAST
-    yield "symbols of one group more", head + pack_blobs(
-        [gates, encode_symbols(np.arange(6 * moving + 6, dtype=np.int32).reshape(-1, 6))]
-    ), LEFT
+    yield (
+        "symbols of one group more",
+        head + pack_blobs([gates, encode_symbols(np.arange(6 * moving + 6, dtype=np.int32).reshape(-1, 6))]),
+        LEFT,
+    )
     none = encode_gates(np.zeros(count, np.uint8), 1)
     yield "nothing moves, but symbols", head + pack_blobs([none, symbols]), "empty table"
     large = encode_symbols(np.full((moving, 6), 2**31 - 1, np.int32))

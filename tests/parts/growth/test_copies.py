@@ -16,10 +16,8 @@ from gsstream.testing.method_driver import MethodUnderTest
 
 def steps_with(**settings: Any) -> list[Step[Any]]:
     method = MethodUnderTest("dense")
-    config = Copies.Config.model_validate(
-        {"gradient": 1e-7, "rounds": 1, "most": 7, "prune_opacity": 0.0, **settings}
-    )
-    method.parts = replace(method.parts, growth=Copies(config), update=NoUpdate())
+    config = Copies.Config.model_validate({"gradient": 1e-7, "rounds": 1, "most": 7, "prune_opacity": 0.0, **settings})
+    method.assembly = replace(method.assembly, growth=Copies(config), update=NoUpdate())
     return method.steps
 
 

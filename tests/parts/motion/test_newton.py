@@ -45,9 +45,7 @@ def test_after_each_view_of_the_first_pass_it_stands_at_the_bottom_of_all_seen_s
     for view in range(views):
         gradient = (matrices[view] @ (descent.values - bottoms[view])[..., None])[..., 0]
         descent.step(gradient, matrices[view])
-        total, weighted = (
-            each[: view + 1].sum(0).numpy() for each in (matrices, matrices @ bottoms[..., None])
-        )
+        total, weighted = (each[: view + 1].sum(0).numpy() for each in (matrices, matrices @ bottoms[..., None]))
         np.testing.assert_allclose(descent.values, np.linalg.solve(total, weighted)[..., 0], atol=1e-6)
 
 
@@ -156,9 +154,9 @@ def test_nothing_that_changed_holds_nothing() -> None:
     rows = np.arange(0, len(case.scene.gaussians.means), 3)
     case.work.narrow(torch.from_numpy(rows))
     zeros = np.zeros((1, 3))
-    moves = GroupTransforms(
-        np.arange(len(rows)), np.zeros(len(rows), np.int64), zeros, zeros, zeros
-    ).map(torch.from_numpy)
+    moves = GroupTransforms(np.arange(len(rows)), np.zeros(len(rows), np.int64), zeros, zeros, zeros).map(
+        torch.from_numpy
+    )
     base = case.scene.gaussians.rows(rows).map(torch.from_numpy)
     found = case.work.loss_and_grad(0, WrtTransforms(base, moves, curvature=True), "changed")
     assert not found.grad.any()
@@ -184,7 +182,7 @@ def test_a_body_that_moved_is_found_where_it_went(seed: int, settings: BodySetti
     def seen(images: np.ndarray) -> EngineContext:
         player = PlayerState(0, replace(fit_fixture().scene, gaussians=gaussians), None)  # type: ignore[arg-type]
         state = StreamState(player, work.hierarchy, frame)
-        return EngineContext(work._parts, state, replace(frame, images=images), FrameLog())
+        return EngineContext(work._assembly, state, replace(frame, images=images), FrameLog())
 
     images = np.stack([seen(blank).shown(after, view).numpy() for view in range(len(cameras))])
     arm = float(np.linalg.norm(gaussians.means[rows] - centre, axis=1).mean())

@@ -117,7 +117,7 @@ MOVES = Rigid(Rigid.Config(votes=0, share=0, hold=0.1))
 
 
 def within(max_bytes: int | None) -> Moved:
-    parts = method_with("motion", MOVES).parts
+    parts = method_with("motion", MOVES).assembly
     state = method_with("motion", MOVES).chain()[1].state
     frame = replace(open_source(SOURCE).frame(2), cameras=state.previous.cameras)
     plan = FramePlan(epochs=1, change_threshold=6.0, rd_lambda=0.0, max_bytes=max_bytes)

@@ -94,11 +94,13 @@ def test_projection_against_a_numerical_jacobian() -> None:
         mean = gaussians.means[i].numpy()
         jacobian = np.stack([(pinhole(mean + e) - pinhole(mean - e)) / 2e-6 for e in 1e-6 * np.eye(3)], 1)
         w, x, y, z = (gaussians.quats[i] / gaussians.quats[i].norm()).numpy()
-        turned = np.array([  # columns: q e_k q*, from the quaternion product
-            [w * w + x * x - y * y - z * z, 2 * (x * y + w * z), 2 * (x * z - w * y)],
-            [2 * (x * y - w * z), w * w - x * x + y * y - z * z, 2 * (y * z + w * x)],
-            [2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z],
-        ]).T  # fmt: skip
+        turned = np.array(
+            [  # columns: q e_k q*, from the quaternion product
+                [w * w + x * x - y * y - z * z, 2 * (x * y + w * z), 2 * (x * z - w * y)],
+                [2 * (x * y - w * z), w * w - x * x + y * y - z * z, 2 * (y * z + w * x)],
+                [2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z],
+            ]
+        ).T
         covariance = turned @ np.diag(np.exp(2 * gaussians.scales[i].numpy())) @ turned.T
         expected = jacobian @ covariance @ jacobian.T + 0.3 * np.eye(2)
         np.testing.assert_allclose(means2d[i].numpy(), pinhole(mean), rtol=1e-10)

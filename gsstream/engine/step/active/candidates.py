@@ -53,9 +53,13 @@ class VoteCache:
 
 
 def changed_rows(
-    change: Change | None, means: torch.Tensor, cameras: Cameras, session: RenderSession, min_votes: float,
+    change: Change | None,
+    means: torch.Tensor,
+    cameras: Cameras,
+    session: RenderSession,
+    min_votes: float,
     book: VoteCache | None = None,
-) -> torch.Tensor:  # fmt: skip
+) -> torch.Tensor:
     """Return [N] bool: Gaussians seen in a changed tile, with at least this share of votes; all without a ``change``.
 
     Arguments:

@@ -27,9 +27,7 @@ _ASPECT_TOLERANCE = 0.01
 
 def looks_like_llff(folder: Path, pattern: str) -> bool:
     """Say whether there is a poses_bounds.npy beside videos, folders or pictures of instants called so (a glob)."""
-    return (folder / POSES_FILE).is_file() and any(
-        any(folder.glob(named)) for named in (pattern, f"frame*1/{pattern}")
-    )
+    return (folder / POSES_FILE).is_file() and any(any(folder.glob(named)) for named in (pattern, f"frame*1/{pattern}"))
 
 
 def read_llff(folder: Path, pattern: str) -> Recording:
@@ -38,9 +36,13 @@ def read_llff(folder: Path, pattern: str) -> Recording:
     names = tuple(clips)
     rig = read_poses_bounds(folder / POSES_FILE, names, clips[names[0]].size)
     return Recording(
-        name=folder.resolve().name, where=str(folder / POSES_FILE), rig=rig, clips=clips, test=names[:1],
+        name=folder.resolve().name,
+        where=str(folder / POSES_FILE),
+        rig=rig,
+        clips=clips,
+        test=names[:1],
         licence="see the data set",
-    )  # fmt: skip
+    )
 
 
 def _camera_clips(folder: Path, pattern: str) -> dict[str, Clip]:

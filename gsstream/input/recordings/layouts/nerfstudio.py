@@ -111,8 +111,9 @@ def _present(folder: Path, path: Path, frames: list[dict[str, Any]], missing: Mi
         raise SourceError(f"{told}; restore them, or take them out of the file")
     warnings.warn(
         f"{told}; they are skipped, as nerfstudio does. To refuse them: --source 'nerfstudio:{folder}?missing=refuse'",
-        RecordingWarning, stacklevel=2,
-    )  # fmt: skip
+        RecordingWarning,
+        stacklevel=2,
+    )
     return there
 
 

@@ -16,8 +16,21 @@ from gsstream.input.recordings.clips import natural_sort_key
 Entry = dict[str, Any]
 Pose = Callable[[Path, Entry], FloatArray]
 _INTRINSICS = (
-    "fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "k1", "k2", "k3", "k4", "p1", "p2", "camera_model"
-)  # fmt: skip
+    "fl_x",
+    "fl_y",
+    "cx",
+    "cy",
+    "w",
+    "h",
+    "camera_angle_x",
+    "k1",
+    "k2",
+    "k3",
+    "k4",
+    "p1",
+    "p2",
+    "camera_model",
+)
 
 
 def group_entries(path: Path, frames: list[Entry], pose: Pose) -> dict[str, list[Entry]]:

@@ -32,9 +32,11 @@ class BinarySteGate(GateSampler):
             default=0.3, ge=0.01, le=100, description="tau, softness of the gradient, no unit, 0.01 to 100 (paper: 0.3)"
         )
         logit_bound: float = Field(
-            default=math.log(1000.0), gt=0, le=50,
+            default=math.log(1000.0),
+            gt=0,
+            le=50,
             description="logits are kept in [-bound, bound], 0 to 50; ln(1000) is p = 0.001 to 0.999 (released code)",
-        )  # fmt: skip
+        )
         noise: Literal["logistic", "none"] = Field(
             default="logistic", description="while training; logistic: paper; none: released training"
         )

@@ -68,9 +68,13 @@ class KeyPointMotion(MotionPart):
 
 
 def _fitted(
-    scene: Scene, work: FitContext, rows: torch.Tensor, chosen: torch.Tensor, settings: KeyPointMotion.Config,
+    scene: Scene,
+    work: FitContext,
+    rows: torch.Tensor,
+    chosen: torch.Tensor,
+    settings: KeyPointMotion.Config,
     order: np.random.Generator,
-) -> Motion | None:  # fmt: skip
+) -> Motion | None:
     """The motion that ``chosen`` of the rows [A], as key points, fit to the images."""
     number, epochs = len(chosen), work.scaled(settings.epochs)
     pixel, wide = pixel_size(scene.gaussians.means, work.cameras), enlargement(work.cameras.width)
@@ -82,10 +86,12 @@ def _fitted(
     lever = pixel / float(shape.size.exp().mean())
     leaves = {name: torch.zeros(number, 3, requires_grad=True) for name in ("shift", "turn")}
     shapes = {"size": shape.size.requires_grad_(), "quat": shape.quat.requires_grad_()}
-    adam = torch.optim.Adam([
-        {"params": list(leaves.values()), "lr": settings.lr * wide},
-        {"params": list(shapes.values()), "lr": settings.lr_influence},
-    ])  # fmt: skip
+    adam = torch.optim.Adam(
+        [
+            {"params": list(leaves.values()), "lr": settings.lr * wide},
+            {"params": list(shapes.values()), "lr": settings.lr_influence},
+        ]
+    )
 
     def points() -> KeyPoints:
         return KeyPoints(shape.centre, leaves["shift"] * pixel, leaves["turn"] * lever, **shapes)

@@ -10,14 +10,18 @@ def gsstream_components() -> list[ComponentSpec]:
     """What moves, and what is corrected."""
     return [
         ComponentSpec(
-            kind="motion", name="keypoints", target="gsstream_comgs.motion:KeyPointMotion",
+            kind="motion",
+            name="keypoints",
+            target="gsstream_comgs.motion:KeyPointMotion",
             summary="two hundred key points move what is around them",
         ),
         ComponentSpec(
-            kind="confidence", name="error-gradient", target="gsstream_comgs.confidence:ErrorGradient",
+            kind="confidence",
+            name="error-gradient",
+            target="gsstream_comgs.confidence:ErrorGradient",
             summary="the share of the Gaussians with the largest gradient of the error",
         ),
-    ]  # fmt: skip
+    ]
 
 
 @hookimpl

@@ -119,6 +119,4 @@ def raise_on_faults(faults: int, splats: SplatArrays) -> None:
         row = int(np.argmax(unusable))
         got = f"{norms[row]:.3g} at row {row} ({int(unusable.sum())} in all)"
         refuse(f"quats: expected norms between 1e-10 and 1e10, got {got}; give them a direction")
-    refuse(
-        "a product of finite parameters overflowed float32; expected values below about 1e15; rescale the scene"
-    )
+    refuse("a product of finite parameters overflowed float32; expected values below about 1e15; rescale the scene")

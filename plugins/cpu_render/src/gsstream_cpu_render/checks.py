@@ -58,8 +58,10 @@ def native_array(
     if not fits:
         refuse(f"{name}: expected shape [{', '.join(map(str, shape))}], got {list(array.shape)}")
     if not array.flags.c_contiguous:
-        refuse(f"{name}: expected a contiguous array, got strides {array.strides} for shape {list(array.shape)}; "
-               "make it contiguous first (numpy.ascontiguousarray, .contiguous())")  # fmt: skip
+        refuse(
+            f"{name}: expected a contiguous array, got strides {array.strides} for shape {list(array.shape)}; "
+            "make it contiguous first (numpy.ascontiguousarray, .contiguous())"
+        )
     if writable and not array.flags.writeable:
         refuse(f"{name}: expected a writable array (it is changed in place), got a read-only one; give a copy")
     return array

@@ -140,8 +140,11 @@ def photometric_loss(
         image, handle, active, wanted, result, (1.0 - dssim_weight) * scale, -dssim_weight * scale
     )
     if not np.isfinite(l1 + dssim):
-        refuse(first_non_finite("image", image) or first_non_finite("target", goal)
-               or "image: expected values in [0, 1], got some so large that the loss overflows")  # fmt: skip
+        refuse(
+            first_non_finite("image", image)
+            or first_non_finite("target", goal)
+            or "image: expected values in [0, 1], got some so large that the loss overflows"
+        )
     return PhotometricLoss(weighted(l1, dssim, dssim_weight, scale), l1 * scale, dssim * scale, result)
 
 

@@ -96,9 +96,13 @@ class NativeRasterizer:
         return self._native
 
     def comparison(
-        self, cached_image: Float32 | None, target: PreparedImage, dssim_weight: float,
-        colours: Sequence[Float32 | None], weights: Float32 | None,
-    ) -> Any:  # fmt: skip
+        self,
+        cached_image: Float32 | None,
+        target: PreparedImage,
+        dssim_weight: float,
+        colours: Sequence[Float32 | None],
+        weights: Float32 | None,
+    ) -> Any:
         """What renders are compared with, as the one handle that the kernels take.
 
         Raises:
@@ -109,16 +113,20 @@ class NativeRasterizer:
         scale = 1.0 / target.image.size
         scales = (1.0 - dssim_weight) * scale, -dssim_weight * scale
         try:
-            return _native.Comparison(
-                self._view.background, cached_image, target.handle, *colours, *scales, weights
-            )
+            return _native.Comparison(self._view.background, cached_image, target.handle, *colours, *scales, weights)
         except ValueError as error:
             refuse_value(str(error))
 
     def loss_and_grad_active(
-        self, rows: SplatArrays, cached_image: Float32, target: PreparedImage, dssim_weight: float,
-        colours: Sequence[Float32 | None], weights: Float32 | None, out: SplatArrays,
-    ) -> float:  # fmt: skip
+        self,
+        rows: SplatArrays,
+        cached_image: Float32,
+        target: PreparedImage,
+        dssim_weight: float,
+        colours: Sequence[Float32 | None],
+        weights: Float32 | None,
+        out: SplatArrays,
+    ) -> float:
         """Render the active rows, compute the loss and write the gradient by the rows: one iteration of a fit.
 
         It stands for `forward_active` with ``touched_only``, `photometric_loss` with ``around`` and `backward_active`,
@@ -144,9 +152,14 @@ class NativeRasterizer:
         return _loss_of(result, rows, target, dssim_weight)
 
     def full_loss_and_grad(
-        self, splats: SplatArrays, target: PreparedImage, dssim_weight: float,
-        colours: Sequence[Float32 | None], out: Sequence[Float32], exposure_grad: Float32 | None,
-    ) -> float:  # fmt: skip
+        self,
+        splats: SplatArrays,
+        target: PreparedImage,
+        dssim_weight: float,
+        colours: Sequence[Float32 | None],
+        out: Sequence[Float32],
+        exposure_grad: Float32 | None,
+    ) -> float:
         """Render all Gaussians, compute the loss and write the gradient by all of them: an iteration of frame 0.
 
         It stands for `forward`, `photometric_loss` and `backward`, one after the other; whole images are neither made

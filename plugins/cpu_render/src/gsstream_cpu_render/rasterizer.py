@@ -27,9 +27,14 @@ from gsstream_cpu_render.view import NEAR, Background
 
 
 def render_numpy(
-    arrays: Sequence[Float32], viewmat: ArrayLike, K: ArrayLike, width: int, height: int,
-    background: Background = (0.0, 0.0, 0.0), near: float = NEAR,
-) -> Float32:  # fmt: skip
+    arrays: Sequence[Float32],
+    viewmat: ArrayLike,
+    K: ArrayLike,
+    width: int,
+    height: int,
+    background: Background = (0.0, 0.0, 0.0),
+    near: float = NEAR,
+) -> Float32:
     """Render raw Gaussians for one camera: [height, width, 3].
 
     ``arrays`` are means, quats, scales, opacities, sh0 and shN, of any float dtype or layout (shapes: SplatArrays); the
@@ -167,9 +172,7 @@ class NumpyRasterizer(NativeRasterizer):
         self._call("backward_active", *self._upstream(v_image, v_alpha), *gradients)
         return gradients
 
-    def update(
-        self, changed: NDArray[np.uint32], rows: SplatArrays, image: Float32, transmittance: Float32
-    ) -> None:
+    def update(self, changed: NDArray[np.uint32], rows: SplatArrays, image: Float32, transmittance: Float32) -> None:
         """Put new values of some rows into the cache and render anew the tiles these rows touched or touch.
 
         Afterwards the cache, and ``image`` and ``transmittance`` if they held the cached render, have the bits that

@@ -127,20 +127,40 @@ class CpuResidualOptimiser(ResidualOptimiser):
             for pair, now in zip(ready, iterations, strict=True)
         ]
         divisor = max(gates.num_gaussians, 1) if penalty.mean else 1
-        rule = [gate.temperature, gate.logit_offset, gate.levels, gate.open_logit, gate.bound, penalty.open_weight,
-                penalty.displacement_weight, divisor]  # fmt: skip
+        rule = [
+            gate.temperature,
+            gate.logit_offset,
+            gate.levels,
+            gate.open_logit,
+            gate.bound,
+            penalty.open_weight,
+            penalty.displacement_weight,
+            divisor,
+        ]
         position = code.latent["means"].start if "means" in code.latent else -1
         tables = [
             _table(values, state)
-            for values, state in ((gates.logits, gates.state), (self._latents, self._states["latents"]),
-                                  (self._matrix, self._states["matrix"]))
-        ]  # fmt: skip
+            for values, state in (
+                (gates.logits, gates.state),
+                (self._latents, self._states["latents"]),
+                (self._matrix, self._states["matrix"]),
+            )
+        ]
         rates = gates.lr, code.lrs.numpy(), code.decoder_lrs[:, 0].contiguous().numpy()
         losses = self._native.run(
-            views, native_scene(splats_of(self._base)), [ATTRIBUTES.index(name) for name in code.feature],
-            self._units.numpy(), code.steps.numpy(), gates.node_of.numpy(), [float(number) for number in rule],
-            epoch.rd_lambda, position, *tables, *rates, (*ADAM_BETAS, ADAM_EPS),
-        )  # fmt: skip
+            views,
+            native_scene(splats_of(self._base)),
+            [ATTRIBUTES.index(name) for name in code.feature],
+            self._units.numpy(),
+            code.steps.numpy(),
+            gates.node_of.numpy(),
+            [float(number) for number in rule],
+            epoch.rd_lambda,
+            position,
+            *tables,
+            *rates,
+            (*ADAM_BETAS, ADAM_EPS),
+        )
         return list(torch.tensor(losses, dtype=torch.float64))
 
     def select_rows(self, rows: torch.Tensor) -> None:

@@ -153,9 +153,7 @@ class CpuSession(RenderSession):
         cached.freeze(self._ids, None)
         return cached.loss_and_grad(wrt.values, target)
 
-    def _by_transforms(
-        self, view: int, target: ViewTarget, wrt: WrtTransforms
-    ) -> LossAndGrad[torch.Tensor] | None:
+    def _by_transforms(self, view: int, target: ViewTarget, wrt: WrtTransforms) -> LossAndGrad[torch.Tensor] | None:
         """None where there is a fault, which the default body finds words for, or the cache is beyond the budget."""
         ready = self.fused_views([view], [target])
         return None if ready is None else loss_and_grad_of_transforms(*ready[0], target, wrt)

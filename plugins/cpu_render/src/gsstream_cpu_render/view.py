@@ -35,9 +35,13 @@ def checked_view(
             empty or huge image.
     """
     view = View(
-        _matrix("viewmat", viewmat, 4), _matrix("K", K, 3), int(width), int(height), float(near),
+        _matrix("viewmat", viewmat, 4),
+        _matrix("K", K, 3),
+        int(width),
+        int(height),
+        float(near),
         np.asarray(background, np.float32),
-    )  # fmt: skip
+    )
     fx, fy, skew = view.K[0, 0], view.K[1, 1], view.K[0, 1]
     if not (fx > 0 and fy > 0):
         refuse_value(f"K: expected positive focal lengths in pixels, got fx = {fx:g}, fy = {fy:g}")

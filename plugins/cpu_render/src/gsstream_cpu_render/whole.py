@@ -24,7 +24,8 @@ def loss_and_grad_of_scene(
         splats_of(rows), target.prepared, target.dssim, exposure_arrays(target), out, by_exposure
     )
     return LossAndGrad(
-        torch.tensor(loss, dtype=torch.float64), grad,
+        torch.tensor(loss, dtype=torch.float64),
+        grad,
         means2d=means2d if wrt.means2d else None,
         exposure=torch.from_numpy(by_exposure) if by_exposure is not None and wrt.exposure else None,
-    )  # fmt: skip
+    )

@@ -69,9 +69,12 @@ def load_kernels(device: str) -> Kernels:
     try:
         gsplat = importlib.import_module("gsplat")
         kernels = Kernels(
-            gsplat.fully_fused_projection, gsplat.spherical_harmonics, gsplat.isect_tiles, gsplat.isect_offset_encode,
+            gsplat.fully_fused_projection,
+            gsplat.spherical_harmonics,
+            gsplat.isect_tiles,
+            gsplat.isect_offset_encode,
             gsplat.rasterize_to_pixels,
-        )  # fmt: skip
+        )
         # gsplat binds its kernels on the first call, so one is made here and not in the middle of a run.
         kernels.harmonics(0, torch.ones(1, 3, device=device), torch.ones(1, 1, 3, device=device))
         torch.cuda.synchronize(device)

@@ -80,9 +80,14 @@ class GsplatSession(RenderSession):
     """
 
     def __init__(
-        self, kernels: Kernels, rigs: Rigs, gaussians: Gaussians[torch.Tensor], active: torch.Tensor | None,
-        cameras: Cameras, background: Background,
-    ) -> None:  # fmt: skip
+        self,
+        kernels: Kernels,
+        rigs: Rigs,
+        gaussians: Gaussians[torch.Tensor],
+        active: torch.Tensor | None,
+        cameras: Cameras,
+        background: Background,
+    ) -> None:
         self._kernels, self._rigs = kernels, rigs
         self._cameras, self._background = cameras, background
         self._home = gaussians.means.device

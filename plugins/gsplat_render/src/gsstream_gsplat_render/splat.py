@@ -45,19 +45,36 @@ def project(
     """Project raw Gaussians [N], N > 0, that are on the device already; ``probe`` [N, 2] is added to the 2-D means."""
     opacities = gaussians.opacities.sigmoid()
     radii, means2d, depths, conics, _ = kernels.project(
-        gaussians.means, None, gaussians.quats, gaussians.scales.exp(), view.viewmat, view.K, view.width, view.height,
-        eps2d=BLUR, near_plane=view.near, far_plane=FAR, radius_clip=0.0, packed=False, calc_compensations=False,
+        gaussians.means,
+        None,
+        gaussians.quats,
+        gaussians.scales.exp(),
+        view.viewmat,
+        view.K,
+        view.width,
+        view.height,
+        eps2d=BLUR,
+        near_plane=view.near,
+        far_plane=FAR,
+        radius_clip=0.0,
+        packed=False,
+        calc_compensations=False,
         opacities=opacities,
-    )  # fmt: skip
+    )
     visible = (radii > 0).all(-1)
     if probe is not None:
         means2d = means2d + probe[None]
     colors = _colors(kernels, gaussians, view, visible)
     # Squeezed and not indexed: the gradient of a view is a view, that of an index is a copy.
     return Projected(
-        visible.squeeze(0), means2d.squeeze(0), depths.squeeze(0), conics.squeeze(0), colors.squeeze(0), opacities,
+        visible.squeeze(0),
+        means2d.squeeze(0),
+        depths.squeeze(0),
+        conics.squeeze(0),
+        colors.squeeze(0),
+        opacities,
         radii.squeeze(0),
-    )  # fmt: skip
+    )
 
 
 def composite(kernels: Kernels, seen: Projected, view: Target, mask: torch.Tensor | None = None) -> Drawn:
@@ -67,9 +84,19 @@ def composite(kernels: Kernels, seen: Projected, view: Target, mask: torch.Tenso
     _, keys, order = kernels.tiles(means2d, radii, seen.depths[None], TILE, columns, rows, packed=False, n_images=1)
     offsets = kernels.offsets(keys, 1, columns, rows).reshape(1, rows, columns)
     image, alpha = kernels.rasterize(
-        means2d, seen.conics[None], seen.colors[None], seen.opacities[None], view.width, view.height, TILE, offsets,
-        order, backgrounds=view.background, masks=None if mask is None else mask[None], packed=False,
-    )  # fmt: skip
+        means2d,
+        seen.conics[None],
+        seen.colors[None],
+        seen.opacities[None],
+        view.width,
+        view.height,
+        TILE,
+        offsets,
+        order,
+        backgrounds=view.background,
+        masks=None if mask is None else mask[None],
+        packed=False,
+    )
     image, alpha = image.squeeze(0), alpha.squeeze((0, 3))
     if mask is not None:
         # gsplat 1.5 writes the background into masked tiles but leaves their alpha as the memory was.
@@ -78,9 +105,12 @@ def composite(kernels: Kernels, seen: Projected, view: Target, mask: torch.Tenso
 
 
 def draw(
-    kernels: Kernels, gaussians: Gaussians[torch.Tensor], view: Target, probe: torch.Tensor | None = None,
+    kernels: Kernels,
+    gaussians: Gaussians[torch.Tensor],
+    view: Target,
+    probe: torch.Tensor | None = None,
     mask: torch.Tensor | None = None,
-) -> Drawn:  # fmt: skip
+) -> Drawn:
     """Draw raw Gaussians [N] that are on the device already."""
     if len(gaussians) == 0:
         return _empty(view)
@@ -112,9 +142,7 @@ def pixels(mask: torch.Tensor, view: Target) -> torch.Tensor:
     return wide[: view.height, : view.width]
 
 
-def _colors(
-    kernels: Kernels, gaussians: Gaussians[torch.Tensor], view: Target, visible: torch.Tensor
-) -> torch.Tensor:
+def _colors(kernels: Kernels, gaussians: Gaussians[torch.Tensor], view: Target, visible: torch.Tensor) -> torch.Tensor:
     """[1, N, 3] colours max(0, 0.5 + harmonics), seen from the camera."""
     viewmat = view.viewmat[0]
     center = -(viewmat[:3, :3].T @ viewmat[:3, 3])

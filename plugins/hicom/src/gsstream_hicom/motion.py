@@ -58,7 +58,7 @@ class CoherentMotion(MotionPart):
             default="each",
             description="what a step is divided by; each: every number of a cell by its own gradient (Adam); cell: all "
             "six by the largest",
-        )  # fmt: skip
+        )
         votes: float = Field(
             default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in what changed"
         )
@@ -81,9 +81,7 @@ class CoherentMotion(MotionPart):
             transforms = _warm_started(scene, start, transforms, config.momentum)
             # Half a cell from its centre, a rotation of one unit moves a Gaussian by a pixel, too.
             unit = np.repeat([pixel, pixel / side], 3)
-            found = fit_transforms_adam(
-                work, transforms, unit, [lr] * iterations, order, measure, config.l1_weight
-            )
+            found = fit_transforms_adam(work, transforms, unit, [lr] * iterations, order, measure, config.l1_weight)
             motion = rounded_motion(groups, able, found, config.step * pixel, config.step * pixel / side)
             if motion is None:
                 continue

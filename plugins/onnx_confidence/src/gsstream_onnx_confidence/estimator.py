@@ -42,9 +42,11 @@ class OnnxConfidence(ConfidenceEstimator):
         )
         pixels: float = Field(default=1.0, gt=0, le=100, description="(flow) length that counts as a change of 0.63")
         floor: float = Field(
-            default=-math.log(1000.0), ge=-50, le=0,
+            default=-math.log(1000.0),
+            ge=-50,
+            le=0,
             description="smallest logit, and that of Gaussians no view sees; the largest is its negative",
-        )  # fmt: skip
+        )
 
     def __init__(self, config: PartConfig | None = None) -> None:
         super().__init__(config)
@@ -91,9 +93,7 @@ class OnnxConfidence(ConfidenceEstimator):
         return found[0]
 
 
-def _pixels(
-    context: FrameContext, view: int, means: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _pixels(context: FrameContext, view: int, means: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Column and row of the pixel each centre falls on, [N] int64, and whether it is in the image, [N] bool."""
     cameras = context.cameras
     pose, K = torch.from_numpy(cameras.viewmats[view]), torch.from_numpy(cameras.Ks[view])

@@ -27,9 +27,14 @@ def densify_epochs(settings: GrowthSettings, epochs: int) -> frozenset[int]:
 
 
 def densify(
-    rows: Gaussians[torch.Tensor], grad_norm: torch.Tensor, allowed: torch.Tensor, room: int, extent: float,
-    settings: GrowthSettings, generator: torch.Generator,
-) -> AddedByDensify:  # fmt: skip
+    rows: Gaussians[torch.Tensor],
+    grad_norm: torch.Tensor,
+    allowed: torch.Tensor,
+    room: int,
+    extent: float,
+    settings: GrowthSettings,
+    generator: torch.Generator,
+) -> AddedByDensify:
     """Clone small and split large rows with the largest screen gradient."""
     hot = (allowed & (grad_norm > settings.grad_threshold)).nonzero()[:, 0]
     large = rows.scales.exp().amax(1) > SPLIT_SIZE * extent
@@ -38,4 +43,3 @@ def densify(
     chosen = order[cost <= room].sort().values
     parents = torch.cat([chosen[~large[chosen]], chosen[large[chosen]].repeat_interleave(2)])
     return AddedByDensify(split_or_clone(rows, parents, large[parents], generator), chosen[large[chosen]])
-

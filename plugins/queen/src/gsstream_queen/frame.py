@@ -64,9 +64,14 @@ class _Frame:
         self._cameras: Cameras = problem.work.cameras
         self._extent = self._cameras.extent
         self._old = OldRows(
-            config, self._scene.rows(problem.active), problem.logits, problem.weights, self._extent, len(self._scene),
+            config,
+            self._scene.rows(problem.active),
+            problem.logits,
+            problem.weights,
+            self._extent,
+            len(self._scene),
             self._cameras.width * self._cameras.height,
-        )  # fmt: skip
+        )
         self._new: list[NewRows] = []
         #: Rows of the scene that a split replaced.
         self._gone = torch.zeros(len(self._scene), dtype=torch.bool)
@@ -116,7 +121,12 @@ class _Frame:
             rows = self._old.values()
             allowed = self._alive & self._problem.dynamic[self._problem.active]
             new = densify(
-                rows, self._statistics.mean, allowed, config.max_added - added_so_far, self._extent, config,
+                rows,
+                self._statistics.mean,
+                allowed,
+                config.max_added - added_so_far,
+                self._extent,
+                config,
                 self._generator,
             )
         self._statistics = DensifyStatistics.zeros(len(self._problem.active), self._problem.active.device)

@@ -88,18 +88,27 @@ class Queen(StreamingMethod[QueenState]):
         with tools.log.phase("optimise"):
             logits = initial_logits(change.difference, change.seen, self.config.gate)[active]
             problem = Problem(
-                work, tools.renderer, tools.background, active, dynamic, self._masks(work, dynamic, tools), logits,
-                state.weights, tools.epochs(frame),
-            )  # fmt: skip
+                work,
+                tools.renderer,
+                tools.background,
+                active,
+                dynamic,
+                self._masks(work, dynamic, tools),
+                logits,
+                state.weights,
+                tools.epochs(frame),
+            )
             result = optimise(self.config, problem, tools.rng.stream("queen", frame.index))
         with tools.log.phase("code"):
             delta = self._harden(state.player, active, result)
             step = self._send(state, frame, tools, delta)
         shifts = None if delta.residual is None else delta.residual.symbols.get("means")
         tools.log.set(
-            loss=result.loss, iterations=result.iterations, dynamic_gaussians=int(dynamic.sum()),
+            loss=result.loss,
+            iterations=result.iterations,
+            dynamic_gaussians=int(dynamic.sum()),
             moved_gaussians=0 if shifts is None else int(shifts.any(1).sum()),
-        )  # fmt: skip
+        )
         return step
 
     def _masks(self, work: FrameTools, dynamic: torch.Tensor, tools: Tools) -> list[torch.Tensor] | None:

@@ -46,9 +46,11 @@ class ChangeSettings(PartConfig):
         default="mean-vector", description="over views; mean-vector: norm of the mean gradient, published"
     )
     dynamic: float = Field(
-        default=3.5e-6, ge=0, le=1e6,
+        default=3.5e-6,
+        ge=0,
+        le=1e6,
         description="difference above which a Gaussian is dynamic, to 1e6; in the units of loss and aggregate",
-    )  # fmt: skip
+    )
 
 
 class GateSettings(PartConfig):
@@ -84,7 +86,9 @@ class GrowthSettings(PartConfig):
     start: float = Field(default=0.04, ge=0, le=1, description="share of the epochs before the first one, 0 to 1")
     stop: float = Field(default=0.8, ge=0, le=1, description="share of the epochs after which there is none, 0 to 1")
     grad_threshold: float = Field(
-        default=1.25e-3, gt=0, le=10,
+        default=1.25e-3,
+        gt=0,
+        le=10,
         description="mean screen gradient above which a Gaussian is densified, half image widths, to 10",
     )
     max_added: int = Field(default=1000, ge=0, le=1_000_000, description="most Gaussians that a frame adds, to 1000000")
@@ -118,14 +122,18 @@ class QueenConfig(PartConfig):
     growth: GrowthSettings = Field(default=GrowthSettings(), description="masked densification")
     change: ChangeSettings = Field(default=ChangeSettings(), description="what changed")
     sigma: float = Field(
-        default=0.0, ge=0, le=1e6,
+        default=0.0,
+        ge=0,
+        le=1e6,
         description="weight of the mean standard deviation of the latents' channels, symbols, to 1e6; published, but "
         "its value is not known to us",
-    )  # fmt: skip
+    )
     rate: float = Field(
-        default=0.0, ge=0, le=10,
+        default=0.0,
+        ge=0,
+        le=10,
         description="weight of the latents' bits per training pixel, as stream.rd_lambda (ours), to 10",
-    )  # fmt: skip
+    )
     rows: Literal["all", "dynamic"] = Field(
         default="all", description="which Gaussians are trained; all: published; dynamic: only those"
     )

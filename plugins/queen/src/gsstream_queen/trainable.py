@@ -32,9 +32,15 @@ class OldRows:
     """A rows of the scene before: base + residual, as it will be sent. Lives only while a frame is optimised."""
 
     def __init__(
-        self, config: QueenConfig, base: Gaussians[torch.Tensor], logits: torch.Tensor,
-        weights: Mapping[str, torch.Tensor], extent: float, total: int, pixels: int,
-    ) -> None:  # fmt: skip
+        self,
+        config: QueenConfig,
+        base: Gaussians[torch.Tensor],
+        logits: torch.Tensor,
+        weights: Mapping[str, torch.Tensor],
+        extent: float,
+        total: int,
+        pixels: int,
+    ) -> None:
         """``base`` are the A rows, ``logits`` [A] their gates, ``total`` the N of the scene.
 
         ``pixels`` of a training view: bits are weighed by them.

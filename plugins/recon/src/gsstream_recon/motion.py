@@ -85,7 +85,7 @@ class AnchorMotion(MotionPart):
             default="each",
             description="what a step is divided by; each: every number of an anchor by its own gradient (Adam); "
             "anchor: all six by the largest",
-        )  # fmt: skip
+        )
         votes: float = Field(
             default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in what changed"
         )
@@ -151,9 +151,12 @@ class AnchorMotion(MotionPart):
         return [self.config.momentum * motion for motion in inherited(mean, old, levels, self.config.neighbours)]
 
     def _fitted(
-        self, work: FitContext, anchored: AnchoredCells, start: list[FloatArray],
+        self,
+        work: FitContext,
+        anchored: AnchoredCells,
+        start: list[FloatArray],
         order: np.random.Generator,
-    ) -> FloatArray:  # fmt: skip
+    ) -> FloatArray:
         """Translations and rotations [C, 6] of the cells; all levels learn at once."""
         config, (base, local) = self.config, narrow_to(work, anchored.cells)
         follows, unit, step = anchored.on(base.means.device)

@@ -45,9 +45,11 @@ class GumbelSigmoid(GateSampler):
             default=10, ge=1, le=255, description="non-zero gate values, 1 (binary) to 255; 10 is one decimal (paper)"
         )
         logit_bound: float = Field(
-            default=math.log(1000.0), gt=0, le=50,
+            default=math.log(1000.0),
+            gt=0,
+            le=50,
             description="logits are kept in [-bound, bound], 0 to 50; ln(1000) is p = 0.001 to 0.999 (released code)",
-        )  # fmt: skip
+        )
         noise: Literal["logistic", "none", "gumbel"] = Field(
             default="logistic",
             description="logistic: paper; none: released training; gumbel: the law of the released initialisation",
@@ -128,8 +130,7 @@ class GumbelSigmoid(GateSampler):
 
 
 def sigmoid_derivative(x: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
-    """Derivative of the sigmoid, given its value at x; equally accurate at both ends, where s (1 - s) loses all digits.
-    """
+    """Derivative of the sigmoid, given its value at x; accurate at both ends, where s (1 - s) loses all digits."""
     return value * torch.sigmoid(-x)
 
 

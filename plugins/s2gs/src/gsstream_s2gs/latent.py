@@ -89,7 +89,6 @@ class LatentResidual(UpdateRule):
                 for name, value in data.items()
             }
 
-
     def codes(self) -> Mapping[str, AttributeCode]:
         """Attribute -> code; an attribute with ``lr`` 0 never changes."""
         entries = {"means": AttributeCode(step=self.config.means.step, lr=self.config.means.lr)}

@@ -59,9 +59,11 @@ class StreamingOctree(Structure):
             default=1.5, ge=1.05, le=16, description="b, distance ratio of two levels, 1.05 to 16 (paper: 1.2 to 3)"
         )
         max_levels: int = Field(
-            default=10, ge=1, le=21,
+            default=10,
+            ge=1,
+            le=21,
             description="upper bound on the number of levels H, 1 to 21; root_exponent + max_levels <= 22",
-        )  # fmt: skip
+        )
         distance_quantile: float = Field(
             default=0.999, gt=0.5, le=1, description="quantile of distances taken as D_max, 0.5 to 1 (released)"
         )

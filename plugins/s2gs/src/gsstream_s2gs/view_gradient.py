@@ -73,13 +73,17 @@ class ViewSpaceGradient(ConfidenceEstimator):
             default=3.0, ge=0, le=100, description="(noise) multiple of the noise where z is 0, to 100"
         )
         noise_minimum: float = Field(
-            default=0.4 / 255, gt=0, le=1,
+            default=0.4 / 255,
+            gt=0,
+            le=1,
             description="(noise) least noise of a camera, image units; 0.4/255 is 8-bit rounding of two frames",
-        )  # fmt: skip
+        )
         perturbation: float = Field(
-            default=0.0, ge=0, le=100,
+            default=0.0,
+            ge=0,
+            le=100,
             description="noise added to |m| in standard deviations of |m|, floored at 0 (paper's robustness table)",
-        )  # fmt: skip
+        )
         seed: int = Field(default=0, ge=0, description="seed of perturbation and noise probes")
         floor: float = Field(
             default=-math.log(1000.0), ge=-50, le=0, description="logit where nothing changes, -50 to 0"

@@ -110,10 +110,18 @@ class CacheMotion(MotionPart):
         # A scene that is flat along an axis has a box all the same.
         high = np.maximum(high, low + np.maximum(np.float32(1e-3 * extent), np.float32(1e-6) * np.abs(low)))
         return FieldShape(
-            (float(low[0]), float(low[1]), float(low[2])), (float(high[0]), float(high[1]), float(high[2])),
-            float(np.float32(config.reach * extent)), config.levels, config.entries, config.features, config.base,
-            float(np.float32(config.growth)), config.width, 2, rng.key("stream3dgs", 0) & 0xFFFFFFFF,
-        )  # fmt: skip
+            (float(low[0]), float(low[1]), float(low[2])),
+            (float(high[0]), float(high[1]), float(high[2])),
+            float(np.float32(config.reach * extent)),
+            config.levels,
+            config.entries,
+            config.features,
+            config.base,
+            float(np.float32(config.growth)),
+            config.width,
+            2,
+            rng.key("stream3dgs", 0) & 0xFFFFFFFF,
+        )
 
     def said(self, scene: Scene, rows: IntArray, cache: Cache, work: FitContext) -> Field | Motion | None:
         """Return what is sent of a cache: the cache, or the rigid motions of cells; None where nothing moves."""
@@ -126,6 +134,11 @@ class CacheMotion(MotionPart):
         pixel = pixel_size(scene.gaussians.means, work.cameras)
         side = float(np.float32(self.config.pixels * enlargement(work.cameras.width) * pixel))
         return approximate_by_cells(
-            scene, rows, work.shell_rows, (cache.shape.reach * shift).numpy(), turn.numpy(), side,
+            scene,
+            rows,
+            work.shell_rows,
+            (cache.shape.reach * shift).numpy(),
+            turn.numpy(),
+            side,
             self.config.step * pixel,
         )

@@ -21,6 +21,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
+from gsstream.discovery.catalog import Catalog
 from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.state.stream_state import Step, StreamState
@@ -28,7 +29,6 @@ from gsstream.input.recordings.base import SourceInfo
 from gsstream.metrics import peak_memory_mb, psnr
 from gsstream.packet import KeyState, PlayerState, StreamMeta, decode_packet, encode_key
 from gsstream.parts.render.base import TILE
-from gsstream.plugins.catalog import Catalog
 from gsstream.recipe.model import ComponentRef, Recipe
 from gsstream_lab.bench.scene import (
     OBJECT_CENTER,
@@ -116,15 +116,24 @@ def bench_frame(plan: FramePlan, catalog: Catalog, progress: Progress) -> dict[s
         "schema": SCHEMA,
         "machine": machine,
         "settings": {
-            "method": plan.recipe.method, "renderer": parts["active"].recipe.renderer.name,
+            "method": plan.recipe.method,
+            "renderer": parts["active"].recipe.renderer.name,
             "change_threshold": parts["active"].recipe.stream.change_threshold,
-            "epochs": plan.recipe.stream.epochs, "views": plan.views, "width": plan.width, "height": plan.height,
-            "moving": plan.moving, "shift_pixels": plan.shift, "noise": NOISE, "seed": plan.seed,
-            "repetitions": plan.repetitions, "warm_up": plan.warm_up, "torch_threads": 1,
+            "epochs": plan.recipe.stream.epochs,
+            "views": plan.views,
+            "width": plan.width,
+            "height": plan.height,
+            "moving": plan.moving,
+            "shift_pixels": plan.shift,
+            "noise": NOISE,
+            "seed": plan.seed,
+            "repetitions": plan.repetitions,
+            "warm_up": plan.warm_up,
+            "torch_threads": 1,
         },
         "cases": results,
         "peak_memory_mb": peak_memory_mb(),
-    }  # fmt: skip
+    }
 
 
 def variants(recipe: Recipe) -> dict[str, Recipe]:
@@ -179,8 +188,10 @@ def _case(plan: FramePlan, parts: Assembly, static: int, ball: _Ball) -> _Case:
     after = _draw(parts, _moved(plan, state.player.gaussians, rig, ball), rig)
     inside = ball.holds(state.player.gaussians)
     facts = {
-        "gaussians": len(inside), "moving": int(inside.sum()), "changed_tiles": round(_changed_share(before, after), 5),
-    }  # fmt: skip
+        "gaussians": len(inside),
+        "moving": int(inside.sum()),
+        "changed_tiles": round(_changed_share(before, after), 5),
+    }
     return _Case(state, Frame(1, 1 / 30, _noisy(after, noise), rig), after, facts)
 
 
@@ -278,10 +289,11 @@ def _outcome(parts: Assembly, case: _Case, step: Step) -> dict[str, Any]:
     quality = {"psnr": shown, "psnr_if_held": stood}
     keys = ("candidate_gaussians", "sent_gaussians", "iterations")
     return {
-        "status": step.status, "bytes": len(step.packet.data),
+        "status": step.status,
+        "bytes": len(step.packet.data),
         **{key: step.metrics[key] for key in keys if key in step.metrics},
         **{name: _mean_psnr(images, case.clean) for name, images in quality.items()},
-    }  # fmt: skip
+    }
 
 
 def _mean_psnr(images: FloatArray, clean: FloatArray) -> float | None:

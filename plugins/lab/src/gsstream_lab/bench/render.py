@@ -14,9 +14,9 @@ from gsstream.core.errors import GsstreamError
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.discovery.catalog import Catalog
 from gsstream.parts.render import backward as known
 from gsstream.parts.render.base import Renderer, RenderOutput
-from gsstream.plugins.catalog import Catalog
 from gsstream_lab.bench.native import NativeBench, find_native, measure_peaks
 from gsstream_lab.bench.roofline import (
     Footprints,
@@ -117,12 +117,13 @@ def bench_render(plan: RenderPlan, catalog: Catalog, progress: Progress) -> dict
         "schema": SCHEMA,
         "machine": {**machine, "isa": measuring.instruction_set() if measuring else None},
         "settings": {"seed": plan.seed, "repetitions": plan.repetitions, "warm_up": plan.warm_up},
-        "peaks": [{"threads": p.threads, "gflops": p.gflops, "gbytes_per_second": p.gbytes_per_second}
-                  for p in peaks.values()],
+        "peaks": [
+            {"threads": p.threads, "gflops": p.gflops, "gbytes_per_second": p.gbytes_per_second} for p in peaks.values()
+        ],
         "scenes": scenes,
         "cases": results,
         "skipped": skipped,
-    }  # fmt: skip
+    }
 
 
 def _scene(plan: RenderPlan, size: Size) -> _Scene:
@@ -138,14 +139,15 @@ def _scene(plan: RenderPlan, size: Size) -> _Scene:
 def _scene_facts(scene: _Scene) -> dict[str, Any]:
     size = scene.size
     return {
-        "gaussians": size.gaussians, "width": size.width, "height": size.height,
-        "visible": int(scene.prints.visible.sum()), "live_pairs": int(scene.pairs.sum()),
-    }  # fmt: skip
+        "gaussians": size.gaussians,
+        "width": size.width,
+        "height": size.height,
+        "visible": int(scene.prints.visible.sum()),
+        "live_pairs": int(scene.pairs.sum()),
+    }
 
 
-def _cases(
-    plan: RenderPlan, scene: _Scene, name: str, part: Renderer, native: NativeBench | None
-) -> list[_Case]:
+def _cases(plan: RenderPlan, scene: _Scene, name: str, part: Renderer, native: NativeBench | None) -> list[_Case]:
     """All shares, on both paths and both levels, of one renderer at one size."""
     cases = []
     for share in plan.shares:
@@ -170,13 +172,19 @@ def _facts(scene: _Scene, name: str, share: float, path: str, active: IntArray |
     size, mask = scene.size, scene.masks[share]
     inside = pixels_of(mask, size.width, size.height)
     return {
-        "renderer": name, "gaussians": size.gaussians, "width": size.width, "height": size.height,
-        "share": share, "tiles": int(mask.sum()), "path": path,
+        "renderer": name,
+        "gaussians": size.gaussians,
+        "width": size.width,
+        "height": size.height,
+        "share": share,
+        "tiles": int(mask.sum()),
+        "path": path,
         "rows": size.gaussians if active is None else len(active),
         "drawn": int(scene.prints.visible.sum()) if share >= 1 else len(scene.prints.in_tiles(mask)),
-        "live_pairs": int(scene.pairs[inside].sum()), "pixels": int(inside.sum()),
+        "live_pairs": int(scene.pairs[inside].sum()),
+        "pixels": int(inside.sum()),
         "floats": 11 + 3 * (scene.gaussians.shN.shape[1] + 1),
-    }  # fmt: skip
+    }
 
 
 def _kernel(scene: _Scene, native: NativeBench, mask: Any, active: IntArray | None) -> Any:

@@ -70,9 +70,15 @@ def footprints(gaussians: Gaussians[FloatArray], cameras: Cameras, view: int = 0
         seen &= (depths > cameras.near_plane) & (reach >= 0)
         triangle = torch.stack([conics[:, 0, 0], conics[:, 0, 1], conics[:, 1, 1]], 1)
     return Footprints(
-        means2d.numpy(), half.numpy(), triangle.numpy(), depths.numpy(), opacities.numpy(), seen.numpy(),
-        cameras.width, cameras.height,
-    )  # fmt: skip
+        means2d.numpy(),
+        half.numpy(),
+        triangle.numpy(),
+        depths.numpy(),
+        opacities.numpy(),
+        seen.numpy(),
+        cameras.width,
+        cameras.height,
+    )
 
 
 def live_pairs(scene: Footprints) -> IntArray:

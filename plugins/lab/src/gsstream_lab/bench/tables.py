@@ -15,13 +15,23 @@ def render_table(data: Mapping[str, Any]) -> str:
     rows = [["renderer", "rows", "scene", "tiles", "thr", *times]]
     for case in data["cases"]:
         scene = f"{case['gaussians'] / 1000:g}k {case['width']}x{case['height']}"
-        rows.append([
-            f"{case['renderer']} ({case['level']})", "all" if case["path"] == "all rows" else f"{case['rows']}",
-            scene, f"{case['share']:.0%}", str(case["threads"]), cell(case["forward_ms"]["min"]),
-            cell(case["backward_ms"]["min"]), cell(case["total_ms"]["min"]), cell(case["total_ms"]["median"]),
-            cell(case["total_ms"]["cpu"]), cell(case["roofline_ms"]), cell(case["ratio"], ".1f"),
-            cell(case["ratio_cpu"], ".1f"),
-        ])  # fmt: skip
+        rows.append(
+            [
+                f"{case['renderer']} ({case['level']})",
+                "all" if case["path"] == "all rows" else f"{case['rows']}",
+                scene,
+                f"{case['share']:.0%}",
+                str(case["threads"]),
+                cell(case["forward_ms"]["min"]),
+                cell(case["backward_ms"]["min"]),
+                cell(case["total_ms"]["min"]),
+                cell(case["total_ms"]["median"]),
+                cell(case["total_ms"]["cpu"]),
+                cell(case["roofline_ms"]),
+                cell(case["ratio"], ".1f"),
+                cell(case["ratio_cpu"], ".1f"),
+            ]
+        )
     isa = f", {data['machine']['isa']}" if data["machine"]["isa"] else ""
     peaks = [
         f"{p['threads']} threads: {p['gflops']:.0f} GFLOP/s, {p['gbytes_per_second']:.1f} GB/s" for p in data["peaks"]
@@ -48,14 +58,22 @@ def frame_table(data: Mapping[str, Any]) -> str:
     }
     for case in data["cases"]:
         least = case["total_ms"]["min"]
-        rows.append([
-            case["sweep"], f"{case['static'] / 1000:g}k", case["variant"], f"{case['changed_tiles']:.1%}",
-            str(case.get("candidate_gaussians", "-")), cell(least / 1000, ".4f"),
-            cell(case["total_ms"]["cpu"] / 1000, ".4f"),
-            *(cell(case["phases_ms"][p]["min"] / 1000 if p in case["phases_ms"] else None, ".4f") for p in phases),
-            str(case["bytes"]), cell(case["psnr"]), cell(case["psnr_if_held"]),
-            "1/" + cell(whole[case["sweep"], case["static"]] / least, ".1f"),
-        ])  # fmt: skip
+        rows.append(
+            [
+                case["sweep"],
+                f"{case['static'] / 1000:g}k",
+                case["variant"],
+                f"{case['changed_tiles']:.1%}",
+                str(case.get("candidate_gaussians", "-")),
+                cell(least / 1000, ".4f"),
+                cell(case["total_ms"]["cpu"] / 1000, ".4f"),
+                *(cell(case["phases_ms"][p]["min"] / 1000 if p in case["phases_ms"] else None, ".4f") for p in phases),
+                str(case["bytes"]),
+                cell(case["psnr"]),
+                cell(case["psnr_if_held"]),
+                "1/" + cell(whole[case["sweep"], case["static"]] / least, ".1f"),
+            ]
+        )
     s = data["settings"]
     notes = [
         headline(data["machine"]),

@@ -54,7 +54,7 @@ def render(
     view, live pixel pairs) and the multiply-add and copy peaks measured in the same run; it needs a renderer that can
     measure them. Close other programs first: their load is part of what is measured.
     """
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.discovery.catalog import load_catalog
 
     _check(how.out)
     from gsstream_lab.bench.render import RenderPlan, bench_render
@@ -93,7 +93,7 @@ def frame(
     moves. Three variants of the recipe: dense (every gate open, everything takes part), gated (its own gates), active
     (and only what changed beyond the noise takes part: stream.change_threshold, 4 where the recipe has none).
     """
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
 
     _check(how.out)

@@ -22,7 +22,8 @@ class Equal:
     at: Annotated[
         Literal["own", "epochs", "time"],
         typer.Option(
-            "--at", help="own: the settings of each recipe; epochs: the same passes a frame; time: the same processor "
+            "--at",
+            help="own: the settings of each recipe; epochs: the same passes a frame; time: the same processor "
             "time, by passes in proportion to what a run at own settings took.",
         ),
     ] = "own"
@@ -66,8 +67,8 @@ def compare(
     are kept: the same command goes on, and more methods may join. A run that fails is recorded and the others go on
     (exit code 1 at the end).
     """
-    from gsstream.core.needs import require_encoder
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.core.install_hints import require_encoder
+    from gsstream.discovery.catalog import load_catalog
     from gsstream_lab.report.groups import read_sweep_data
     from gsstream_lab.sweep.compare import equal_epochs, equal_time, own_settings
     from gsstream_lab.sweep.drive import run_sweep

@@ -44,11 +44,11 @@ def gap(
     contact sheet shows both close up. Give enough passes: below about 150, a fresh reconstruction may be worse than the
     cameras allow, and the gap too small.
     """
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.engine.run.output import write_whole
     from gsstream.engine.run.recording import open_recording
     from gsstream.evaluation.gallery import write_sheet
     from gsstream.player.playback import Playback
-    from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import load_recipe
     from gsstream_lab.gap.fresh import FreshFrames, check_cameras
     from gsstream_lab.gap.measure import GAP_FILES, default_frames, measure_gap
@@ -106,7 +106,5 @@ def _frames(text: str, there: range) -> list[int]:
     except ValueError:
         raise InputError(f"--at {text}: expected frames such as 10,20,29") from None
     if missing := [frame for frame in found if frame not in there]:
-        raise InputError(
-            f"--at: the stream has frames {there[0]} to {there[-1]}, got {', '.join(map(str, missing))}"
-        )
+        raise InputError(f"--at: the stream has frames {there[0]} to {there[-1]}, got {', '.join(map(str, missing))}")
     return found

@@ -22,9 +22,9 @@ def left_behind(
     """
     from gsstream.cli.listing import table
     from gsstream.cli.streams import check_recipe, named_recording, stream_file
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.engine.run.recording import reopen_recording
     from gsstream.player.playback import Playback
-    from gsstream.plugins.catalog import load_catalog
     from gsstream_lab.left_behind import left_behind as counts
 
     file, catalog = stream_file(run), load_catalog()

@@ -36,10 +36,13 @@ class RecordingOptions:
         from gsstream_lab.sweep.config import Scene
 
         return Scene(
-            name=scene_name(self.source), uri=self.source, scale=self.scale, frames=self.frames or frames,
+            name=scene_name(self.source),
+            uri=self.source,
+            scale=self.scale,
+            frames=self.frames or frames,
             recipe=None if self.recipe is None else str(self.recipe.resolve()),
             set={".".join(path): leaf.value for path, leaf in map(read_override, self.settings or ())},
-        )  # fmt: skip
+        )
 
     def next_command(self, recipe: Path, out: Path) -> str:
         """Return the command that encodes the whole recording with a recipe, ready for a shell."""

@@ -22,7 +22,8 @@ def report(
     sheets: Annotated[
         str,
         typer.Option(
-            "--sheets", metavar="SCENES|none",
+            "--sheets",
+            metavar="SCENES|none",
             help="Scenes to show pictures of, comma-separated. They hold images of the recording: mind its licence.",
         ),
     ] = "none",
@@ -32,7 +33,7 @@ def report(
     Pareto fronts, what each knob buys, all recipes with their spread over seeds, curves over frames; the paper's
     numbers beside ours where the sweep names a table of it. Everything is computed from the table.
     """
-    from gsstream.core.needs import require_encoder
+    from gsstream.core.install_hints import require_encoder
     from gsstream_lab.report.groups import read_sweep_data
 
     require_encoder()

@@ -24,7 +24,9 @@ def search(
     tried: Annotated[
         list[str] | None,
         typer.Option(
-            "--try", metavar="KEY=A,B,...", help="Values of a recipe key; repeatable; by default degree of harmonics "
+            "--try",
+            metavar="KEY=A,B,...",
+            help="Values of a recipe key; repeatable; by default degree of harmonics "
             "and, for an octree, its root, levels and base.",
         ),
     ] = None,
@@ -37,9 +39,9 @@ def search(
     split), while that gains more than 0.05 dB; again from the first key until none moves. Test cameras have no say. One
     frame (the default here) only frame 0 is compared; with --frames 5 or so the frames after it are.
     """
-    from gsstream.core.needs import require_encoder
+    from gsstream.core.install_hints import require_encoder
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.engine.assembly.assemble import assemble
-    from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import resolve_recipe
     from gsstream_lab.sweep.plan import make_plan
     from gsstream_lab.sweep.search import SweepScore, climb, usual_ladders, value_of

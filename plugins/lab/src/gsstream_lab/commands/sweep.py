@@ -39,8 +39,8 @@ def sweep(
     Cells that the table holds are kept; those that failed or were cut off are made again. A cell that fails is recorded
     and the others go on (exit code 1 at the end). Ctrl-C stops at once; the same command continues.
     """
-    from gsstream.core.needs import require_encoder
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.core.install_hints import require_encoder
+    from gsstream.discovery.catalog import load_catalog
     from gsstream_lab.sweep.config import read_sweep
     from gsstream_lab.sweep.plan import make_plan
 

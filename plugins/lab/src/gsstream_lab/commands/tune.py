@@ -50,8 +50,8 @@ def tune(
     training cameras (the tuning split); test cameras have no say. Nothing fits: the table says what came nearest,
     nothing is written, and the exit code is 1.
     """
-    from gsstream.core.needs import require_encoder
-    from gsstream.plugins.catalog import load_catalog
+    from gsstream.core.install_hints import require_encoder
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.recipe.budget import budget_overrides
     from gsstream.recipe.load import resolve_recipe
     from gsstream_lab.sweep.plan import make_plan
@@ -71,8 +71,8 @@ def tune(
 
 def _limits(recipe: Recipe, source: str) -> Budget:
     """The budget, with a rate turned into the size of a packet of this recording."""
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.engine.run.recording import open_recording
-    from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.budget import sized
     from gsstream_lab.jobs.folder import recording_uri
 

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from gsstream.core.errors import InputError
+from gsstream.discovery.catalog import Catalog
 from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.budget.memory import limit_memory
 from gsstream.engine.run.encoder import Callbacks, Encoder
 from gsstream.engine.run.output import write_whole
 from gsstream.input.recordings.base import FrameSource, SourceInfo, check_index
 from gsstream.packet import EncodedPacket, StreamMeta, StreamWriter
-from gsstream.plugins.catalog import Catalog
 from gsstream.recipe.model import LATER_KEYS, Recipe
 
 #: Called with (frame, iterations done, iterations in all).
@@ -42,7 +42,7 @@ def fresh_recipe(recipe: Recipe, epochs: int | None = None) -> Recipe:
 class FreshFrames:
     """The fresh reconstructions of one recording by one recipe, one stream file of a single packet for each frame."""
 
-    parts: Assembly  # assembled from :func:`fresh_recipe`
+    assembly: Assembly  # assembled from :func:`fresh_recipe`
     source: FrameSource  # the recording as the run opened it
     cache: Path  # folder that keeps them; several runs may share one, because a file's name says what it was made of
 
@@ -51,18 +51,18 @@ class FreshFrames:
         cls, recipe: Recipe, source: FrameSource, cache: Path, catalog: Catalog, epochs: int | None = None
     ) -> FreshFrames:
         """Return those of a run by its recipe."""
-        parts = assemble(fresh_recipe(recipe, epochs), catalog)
-        return cls(limit_memory(parts, source.info), source, cache)
+        assembly = assemble(fresh_recipe(recipe, epochs), catalog)
+        return cls(limit_memory(assembly, source.info), source, cache)
 
     @property
     def epochs(self) -> int:
         """Most passes that a reconstruction makes over its training images."""
-        first = self.parts.recipe.first_frame
+        first = self.assembly.recipe.first_frame
         return min(first.epochs, -(-first.max_iterations // max(1, len(self.source.info.train))))
 
     def file(self, frame: int) -> Path:
         """Return where the reconstruction of a frame lies, or will."""
-        recipe = self.parts.recipe
+        recipe = self.assembly.recipe
         values = recipe.model_dump(mode="json", exclude=set(LATER_KEYS))
         values["budget"] = {"memory": values["budget"]["memory"]}  # of a budget, frame 0 knows memory alone
         made_of = [self.source.info.uri, self.source.info.train.ids, recipe.seed, values]
@@ -80,7 +80,7 @@ class FreshFrames:
             return False
         packets: list[EncodedPacket] = []
         listeners = Callbacks(packet=packets.append, progress=lambda done, total, *_: progress(frame, done, total))
-        Encoder(self.parts, self.source.info, callbacks=listeners).encode(self.source.frame(frame, "train"))
+        Encoder(self.assembly, self.source.info, callbacks=listeners).encode(self.source.frame(frame, "train"))
         self.cache.mkdir(parents=True, exist_ok=True)
         part = path.with_name(f".{path.name}.{os.getpid()}.part")
         part.unlink(missing_ok=True)

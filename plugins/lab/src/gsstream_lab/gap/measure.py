@@ -24,9 +24,12 @@ from gsstream.player.render import PlayerRenderer, find_renderer, render
 #: What ``gsstream gap`` writes into the folder of a run: the table, and every number behind it.
 GAP_FILES = ("gap.txt", "gap.json")
 _QUANTITIES = {
-    "psnr": "whole", "psnr_moving": "moving", "psnr_changed": "changed", "psnr_seen": "seen",
+    "psnr": "whole",
+    "psnr_moving": "moving",
+    "psnr_changed": "changed",
+    "psnr_seen": "seen",
     "psnr_changed_seen": "changed, seen",
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,9 +101,14 @@ class Gap:
 
 
 def measure_gap(
-    stream: Path, fresh: Mapping[int, Path], source: FrameSource, epochs: int, *,
-    renderer: PlayerRenderer | None = None, progress: Callable[[int, int], None] | None = None,
-) -> Gap:  # fmt: skip
+    stream: Path,
+    fresh: Mapping[int, Path],
+    source: FrameSource,
+    epochs: int,
+    *,
+    renderer: PlayerRenderer | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Gap:
     """Render frames of a stream and of their fresh reconstructions for the test cameras, and compare them.
 
     Moving and changed pixels are those against the stream's first frame; noise is measured between its first two.

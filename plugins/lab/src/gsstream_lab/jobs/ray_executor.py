@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from gsstream.core.errors import InputError, PluginUnavailable
-from gsstream.core.needs import install_extra
+from gsstream.core.install_hints import install_extra
 from gsstream_lab.jobs.base import Finished, Work, thread_environment
 
 #: What a worker must know of the environment that the sweep was started in.

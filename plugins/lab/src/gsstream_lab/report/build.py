@@ -59,8 +59,16 @@ def _where_it_ran(data: SweepData) -> list[Block]:
         load = f", load {min(loads):.1f} to {max(loads):.1f}" if loads else ""
         dates = f"{min(row['date'] for row in mine)} to {max(row['date'] for row in mine)}"
         workers = ", ".join(sorted({f"{row['workers']} x {row['threads']}" for row in mine}))
-        lines.append([facts["processor"], f"{facts['processors_usable']}{gpu}", f"{workers}{load}", dates,
-                      f"Python {facts['python']}, torch {facts['torch']}, {versions}", facts["code"]])  # fmt: skip
+        lines.append(
+            [
+                facts["processor"],
+                f"{facts['processors_usable']}{gpu}",
+                f"{workers}{load}",
+                dates,
+                f"Python {facts['python']}, torch {facts['torch']}, {versions}",
+                facts["code"],
+            ]
+        )
     head = ["machine", "processors", "workers x threads", "when", "versions", "code"]
     count = f"{len(rows)} finished runs of {len(rows) + len(data.failed) + len(data.missing)}"
     notes = [f"{count}: {len(data.failed)} failed, {len(data.missing)} not run."]
@@ -81,8 +89,13 @@ def _scene(data: SweepData, scene: str) -> list[Block]:
     groups = data.of(scene)
     blocks: list[Block] = [f"## {scene}", _noise(groups)]
     if measured_goods(groups):
-        blocks.append(Picture(f"{scene}-pareto.png", pareto_figure(groups, f"{scene}: quality against cost"),
-                              f"Quality against cost on {scene}, one point per recipe"))  # fmt: skip
+        blocks.append(
+            Picture(
+                f"{scene}-pareto.png",
+                pareto_figure(groups, f"{scene}: quality against cost"),
+                f"Quality against cost on {scene}, one point per recipe",
+            )
+        )
     blocks += [_fronts(groups), _all_runs(groups, data.measured())]
     found = effects(groups, [*QUALITIES, *measured_costs(groups)])
     if found:
@@ -91,8 +104,13 @@ def _scene(data: SweepData, scene: str) -> list[Block]:
     for name, rows in data.config.get("paper_tables", {}).items():
         blocks.append(beside_ours(paper_table(name), groups, scene, rows))
     curves = curve_groups(groups)
-    blocks.append(Picture(f"{scene}-frames.png", frame_curves(curves, f"{scene}, seed {curves[0].runs[0].seed}"),
-                          f"Quality, bytes and seconds of every frame on {scene}{_some(curves, groups)}"))  # fmt: skip
+    blocks.append(
+        Picture(
+            f"{scene}-frames.png",
+            frame_curves(curves, f"{scene}, seed {curves[0].runs[0].seed}"),
+            f"Quality, bytes and seconds of every frame on {scene}{_some(curves, groups)}",
+        )
+    )
     return blocks
 
 

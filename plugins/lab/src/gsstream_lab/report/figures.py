@@ -23,8 +23,10 @@ _CURVES = len(COLORS)
 #: With more variants than colours, the next ones have another shape.
 _SHAPES = "os^DPX"
 _QUALITY = {
-    "psnr": "PSNR, dB", "psnr_moving": "PSNR on moving pixels, dB", "psnr_changed": "PSNR on changed pixels, dB",
-}  # fmt: skip
+    "psnr": "PSNR, dB",
+    "psnr_moving": "PSNR on moving pixels, dB",
+    "psnr_changed": "PSNR on changed pixels, dB",
+}
 
 
 def measured_costs(groups: Sequence[Group]) -> list[str]:
@@ -118,9 +120,16 @@ def _panel(axis: Any, groups: Sequence[Group], good: str, cost: str, looks: dict
         size = 7 if not group.axes else 4
         color, shape = looks[group.variant]
         axis.errorbar(
-            x, y, fmt=shape, markersize=size, color=color, alpha=0.9 if not group.axes else 0.6,
-            elinewidth=1, markeredgewidth=0, **bars,
-        )  # fmt: skip
+            x,
+            y,
+            fmt=shape,
+            markersize=size,
+            color=color,
+            alpha=0.9 if not group.axes else 0.6,
+            elinewidth=1,
+            markeredgewidth=0,
+            **bars,
+        )
         if not group.axes:
             _name(axis, group.variant, (x, y), index in order)
     front = [points[i] for i in order]

@@ -65,8 +65,12 @@ class Effect:
         better = self.deltas[good] > 0
         if self.ties[cost] or not (cheaper or dearer):
             return "better, cost tied" if better else "worse, cost tied"
-        return {(True, True): "better and cheaper", (True, False): "buys", (False, True): "saves",
-                (False, False): "worse and dearer"}[better, cheaper]  # fmt: skip
+        return {
+            (True, True): "better and cheaper",
+            (True, False): "buys",
+            (False, True): "saves",
+            (False, False): "worse and dearer",
+        }[better, cheaper]
 
 
 def effects(groups: Sequence[Group], keys: Sequence[str]) -> list[Effect]:

@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from gsstream.core.shapes import FloatArray
+from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.run.recording import reopen_recording
 from gsstream.evaluation.contact_sheet import most_changed_window, sheet_of_stream
 from gsstream.evaluation.evaluate import StreamFrames
@@ -22,7 +23,6 @@ from gsstream.metrics import changed_mask, psnr
 from gsstream.player.play import write_pictures
 from gsstream.player.playback import Playback
 from gsstream.player.render import find_renderer, to_bytes
-from gsstream.plugins.catalog import load_catalog
 from gsstream_lab.jobs.folder import recording_uri
 from gsstream_lab.report.document import Block, Picture, Table
 from gsstream_lab.report.groups import SweepData
@@ -157,9 +157,11 @@ def side_by_side(folder: Path, data: SweepData, scene: str, source: FrameSource)
         video = together.video(Path(temporary) / "video.webp", source.info.fps)
         text = f"Camera {together.camera}: the last frame, then what changed most close up, with PSNR on changed pixels"
         return [
-            "### Pictures", Picture("pictures.jpg", sheet.read_bytes(), text),
-            "### Video", Picture("video.webp", video, f"Every frame from camera {together.camera}"),
-        ]  # fmt: skip
+            "### Pictures",
+            Picture("pictures.jpg", sheet.read_bytes(), text),
+            "### Video",
+            Picture("video.webp", video, f"Every frame from camera {together.camera}"),
+        ]
 
 
 def decoding(folder: Path, data: SweepData, scene: str) -> Table:

@@ -88,8 +88,7 @@ def spread(values: Sequence[float]) -> float:
 
 
 def cell(key: str, value: float, spread: float = math.nan) -> str:
-    """Return ``31.22`` or ``31.22 ± 0.04``; "-" for what was not measured.
-    """
+    """Return ``31.22`` or ``31.22 ± 0.04``; "-" for what was not measured."""
     if not math.isfinite(value):
         return "-"
     form = BY_KEY[key].form

@@ -58,10 +58,16 @@ def bd_rate(anchor: Sequence[tuple[float, float]], other: Sequence[tuple[float, 
     (rates, quality), (other_rates, other_quality) = zip(*anchor, strict=True), zip(*other, strict=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # that they overlap in part is said in the table's caption
-        return float(library(
-            list(rates), list(quality), list(other_rates), list(other_quality), method="pchip",
-            require_matching_points=False,
-        ))  # fmt: skip
+        return float(
+            library(
+                list(rates),
+                list(quality),
+                list(other_rates),
+                list(other_quality),
+                method="pchip",
+                require_matching_points=False,
+            )
+        )
 
 
 def curve_blocks(groups: Sequence[Group], scene: str) -> list[Block]:
@@ -71,9 +77,12 @@ def curve_blocks(groups: Sequence[Group], scene: str) -> list[Block]:
         blocks += [
             _table(axis, curves),
             _READING,
-            Picture(f"{scene}-{axis.rpartition('.')[2]}-curves.png", _figure(axis, curves),
-                    f"Quality against bytes on {scene}, a curve for each recipe over {axis}"),
-        ]  # fmt: skip
+            Picture(
+                f"{scene}-{axis.rpartition('.')[2]}-curves.png",
+                _figure(axis, curves),
+                f"Quality against bytes on {scene}, a curve for each recipe over {axis}",
+            ),
+        ]
     return blocks
 
 
@@ -116,8 +125,14 @@ def _figure(axis: str, curves: Sequence[Curve]) -> bytes:
     for panel, quality in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
         for place, curve in enumerate(curves):
             points = sorted((group.mean("kb"), group.mean(quality)) for group in curve.groups)
-            panel.plot(*zip(*points, strict=True), "o-", markersize=4, linewidth=1.2,
-                       color=COLORS[place % len(COLORS)], label=curve.name)  # fmt: skip
+            panel.plot(
+                *zip(*points, strict=True),
+                "o-",
+                markersize=4,
+                linewidth=1.2,
+                color=COLORS[place % len(COLORS)],
+                label=curve.name,
+            )
         style(panel, logarithmic=True)
         panel.set_xlabel(BY_KEY["kb"].title, fontsize=9)
         panel.set_title(BY_KEY[quality].title, fontsize=9, loc="left")

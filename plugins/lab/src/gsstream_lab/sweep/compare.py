@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gsstream.core.errors import InputError, RecipeError
+from gsstream.discovery.catalog import Catalog
 from gsstream.input.recordings.options import SplitName
-from gsstream.plugins.catalog import Catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream_lab.sweep.config import FirstFrame, Measure, Scene, SweepConfig, Variant
 
@@ -21,18 +21,25 @@ def own_settings(
     """Return the sweep in which every method keeps the settings of its recipe."""
     files = {method for method in methods if method.endswith((".yaml", ".yml"))}
     variants = [
-        Variant(name=Path(method).stem, recipe=str(Path(method).resolve())) if method in files
+        Variant(name=Path(method).stem, recipe=str(Path(method).resolve()))
+        if method in files
         else Variant(name=method, method=method)
         for method in methods
-    ]  # fmt: skip
+    ]
     names = [variant.name for variant in variants]
     for name in names:
         if names.count(name) > 1:
             raise RecipeError(f"two methods are called {name!r}; give each once, or rename the recipe file")
     return SweepConfig(
-        name="compare", description=f"{_WHAT} its own settings.", scenes=[scene], seeds=list(seeds), variants=variants,
-        first_frame=FirstFrame(share="scene"), split=split, measure=Measure(fps=True),
-    )  # fmt: skip
+        name="compare",
+        description=f"{_WHAT} its own settings.",
+        scenes=[scene],
+        seeds=list(seeds),
+        variants=variants,
+        first_frame=FirstFrame(share="scene"),
+        split=split,
+        measure=Measure(fps=True),
+    )
 
 
 def equal_epochs(config: SweepConfig, epochs: Sequence[int], catalog: Catalog) -> SweepConfig:

@@ -70,11 +70,11 @@ def run_job(job: Job) -> Outcome:
 
 
 def _run(job: Job, folder: Path) -> Outcome:
+    from gsstream.discovery.catalog import load_catalog
     from gsstream.engine.assembly.assemble import assemble
     from gsstream.engine.run.metrics_log import read_metrics
     from gsstream.engine.run.recording import open_recording, read_first_frame
     from gsstream.engine.run.session import METRICS, STREAM, run
-    from gsstream.plugins.catalog import load_catalog
     from gsstream.recipe.load import recipe_hash
     from gsstream_lab.energy import EnergyMeter, FrameEnergy
 
@@ -102,9 +102,14 @@ def _run(job: Job, folder: Path) -> Outcome:
     machine, when = _machine(parts)
     facts |= {**when, "cell_seconds": time.perf_counter() - started, "threads": os.environ.get("GSSTREAM_THREADS")}
     return Outcome(
-        job.id, tuple(frames), parts.recipe.model_dump(mode="json"), recipe_hash(parts.recipe),
-        (folder / STREAM).read_bytes(), machine, facts,
-    )  # fmt: skip
+        job.id,
+        tuple(frames),
+        parts.recipe.model_dump(mode="json"),
+        recipe_hash(parts.recipe),
+        (folder / STREAM).read_bytes(),
+        machine,
+        facts,
+    )
 
 
 def _measure(measure: Measure, stream: Path, recording: FrameSource, frames: list[dict[str, Any]]) -> dict[str, Any]:
@@ -178,8 +183,16 @@ def _code_hash(parts: Assembly) -> str:
     """Hash of the sources in use: tells two states of a checkout apart that have the same version."""
     import importlib
 
-    used = (parts.structure, parts.confidence, parts.propagation, parts.gate, parts.regularizer, parts.update,
-            parts.renderer, parts.loss)  # fmt: skip
+    used = (
+        parts.structure,
+        parts.confidence,
+        parts.propagation,
+        parts.gate,
+        parts.regularizer,
+        parts.update,
+        parts.renderer,
+        parts.loss,
+    )
     digest = hashlib.sha256()
     for name in sorted({"gsstream", *(type(part).__module__.partition(".")[0] for part in used)}):
         for folder in importlib.import_module(name).__path__:

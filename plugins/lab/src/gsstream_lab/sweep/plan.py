@@ -145,9 +145,14 @@ def _uniform(axis: Range, draw: random.Random) -> float:
 
 
 def _resolve(
-    config: SweepConfig, scene: Scene, variant: Variant, axes: Mapping[str, Any], seed: int, folder: Path,
+    config: SweepConfig,
+    scene: Scene,
+    variant: Variant,
+    axes: Mapping[str, Any],
+    seed: int,
+    folder: Path,
     find_method: FindMethod,
-) -> ResolvedRecipe:  # fmt: skip
+) -> ResolvedRecipe:
     """Method <- variant's file <- scene's file <- split <- set of all, scene, variant <- axes <- seed and size."""
     size = {"seed": seed, "scale": scene.scale, "frames": scene.frames}
     written = [

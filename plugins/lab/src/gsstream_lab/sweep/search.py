@@ -79,9 +79,15 @@ class SweepScore:
     """
 
     def __init__(
-        self, scene: Scene, method: str, seed: int, out: Path, find_method: FindMethod,
-        executor: Callable[[], Executor], say: Callable[[str], None],
-    ) -> None:  # fmt: skip
+        self,
+        scene: Scene,
+        method: str,
+        seed: int,
+        out: Path,
+        find_method: FindMethod,
+        executor: Callable[[], Executor],
+        say: Callable[[str], None],
+    ) -> None:
         self._scene, self._method, self._seed, self._out = scene, method, seed, out
         self._find, self._executor, self._say = find_method, executor, say
 
@@ -89,10 +95,13 @@ class SweepScore:
         """Return the sweep along one key."""
         others = {name: value for name, value in settings.items() if name != key}
         return SweepConfig(
-            name="search", description=f"values of {key}", scenes=[self._scene], seeds=[self._seed],
+            name="search",
+            description=f"values of {key}",
+            scenes=[self._scene],
+            seeds=[self._seed],
             variants=[Variant(name=self._method, method=self._method, set=others, axes={key: list(values)})],
             first_frame=FirstFrame(share="own"),
-        )  # fmt: skip
+        )
 
     def __call__(self, settings: Mapping[str, Any], key: str, values: Sequence[Any]) -> list[float]:
         """Run what the table does not hold yet, and return the quality of each value."""

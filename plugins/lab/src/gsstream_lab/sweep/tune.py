@@ -78,9 +78,13 @@ def candidates(methods: Sequence[str], budget: Budget) -> list[Variant]:
 def pilot(scene: Scene, methods: Sequence[str], budget: Budget, seed: int) -> SweepConfig:
     """Return the sweep that tries them."""
     return SweepConfig(
-        name="tune", description="pilot of gsstream tune", scenes=[scene], seeds=[seed],
-        variants=candidates(methods, budget), first_frame=FirstFrame(share="scene"),
-    )  # fmt: skip
+        name="tune",
+        description="pilot of gsstream tune",
+        scenes=[scene],
+        seeds=[seed],
+        variants=candidates(methods, budget),
+        first_frame=FirstFrame(share="scene"),
+    )
 
 
 def give_first_frame(plan: Plan, out: Path, stream: Path) -> None:

@@ -126,7 +126,7 @@ def test_ring_five_a_failed_frame_is_repeated_when_the_recipe_says_so(drill, tmp
         assert warning.replace("failed at frame 3", f"failed at frame {frame}") in run.stderr
     documented(f"warning: frame 3 repeats the one before it: {FAULTS['confidence=raises']}")
     lines = (out / "metrics.jsonl").read_text().splitlines()
-    assert ["\"error\"" in line for line in lines] == [False, False, False, True, True]
+    assert ['"error"' in line for line in lines] == [False, False, False, True, True]
     with Playback(out / "stream.gss") as playing:
         scenes = [scene for _, scene in playing]
     assert (scenes[4].means == scenes[2].means).all()

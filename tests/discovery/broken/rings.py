@@ -18,8 +18,10 @@ _PARTS = {
 def gsstream_components():
     return [
         ComponentSpec(
-            kind=kind, name=name, summary="for the failure drill",
+            kind=kind,
+            name=name,
+            summary="for the failure drill",
             target=f"gsstream_absent:{cls}" if name == "needs-a-library" else f"gsstream_rings.parts:{cls}",
         )
         for name, (kind, cls) in _PARTS.items()
-    ]  # fmt: skip
+    ]

@@ -1,4 +1,4 @@
-"""Signs of life: what long work is at, as a bar on a terminal and as plain lines elsewhere."""
+"""Progress of long work: a bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 #: What is done, how much of it, and of how much: 0 where that is not known.
 Tell = Callable[[str, int, int], None]
 #: Seconds after which a line is printed though nothing has changed. With the time that it takes to wake up, no more
-#: than five seconds lie between two signs.
+#: than five seconds lie between two lines.
 EVERY = 4.0
 #: Seconds after which the pace of something counts as known.
 PACE = 2.0
 
 
 def silent(_what: str, _done: int, _total: int) -> None:
-    """Tell nobody."""
+    """Show no progress: the callback of callers that want none."""
 
 
 def duration(seconds: float) -> str:
@@ -32,7 +32,7 @@ def duration(seconds: float) -> str:
     return f"{seconds:.0f} seconds"
 
 
-class Signs:
+class ProgressDisplay:
     """A bar with count and time left on a terminal; elsewhere a line every few seconds, as long as this is open.
 
     Work that ends before the first line is due prints nothing.
@@ -55,18 +55,24 @@ class Signs:
         self._began = self._changed = self._printed = clock()
         self._first = 0
 
-    def __enter__(self) -> Signs:
-        # What follows at once on other signs goes on with their silence.
-        closed, printed = Signs._before
+    def __enter__(self) -> ProgressDisplay:
+        # A display that follows another one at once counts its silence from the last line of that one.
+        closed, printed = ProgressDisplay._before
         self._printed = printed if 0 <= self._clock() - closed < 1 else self._clock()
         if self._live:
             from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
             self._bar = Progress(
-                TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[count]}"),
-                TextColumn("{task.fields[note]}"), TimeElapsedColumn(), TextColumn("gone,"),
-                TimeRemainingColumn(), TextColumn("left"), console=self._console,
-            )  # fmt: skip
+                TextColumn("{task.description}"),
+                BarColumn(),
+                TextColumn("{task.fields[count]}"),
+                TextColumn("{task.fields[note]}"),
+                TimeElapsedColumn(),
+                TextColumn("gone,"),
+                TimeRemainingColumn(),
+                TextColumn("left"),
+                console=self._console,
+            )
             self._bar.start()
         elif not self._quiet:
             self._thread = threading.Thread(target=self._watch, daemon=True)
@@ -74,7 +80,7 @@ class Signs:
         return self
 
     def __exit__(self, *_: object) -> None:
-        Signs._before = self._clock(), self._printed
+        ProgressDisplay._before = self._clock(), self._printed
         self._over.set()
         if self._bar:
             self._bar.stop()

@@ -14,9 +14,9 @@ import pytest
 from packaging.requirements import Requirement
 
 from gsstream.cli.main import run_command
-from gsstream.core import needs
-from gsstream.core.needs import ENCODER, SHIPPED, install, install_part, install_renderer, page
-from gsstream.plugins.catalog import load_catalog
+from gsstream.core import install_hints
+from gsstream.core.install_hints import ENCODER, SHIPPED, install, install_part, install_renderer, page
+from gsstream.discovery.catalog import load_catalog
 
 ROOT = Path(__file__).parents[2]
 #: Where messages name extras.
@@ -68,16 +68,16 @@ def test_the_command_is_of_the_environment_that_runs(monkeypatch: pytest.MonkeyP
 
 
 def test_what_no_index_has_comes_from_sources_or_wheels(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(needs, "_is_installed", lambda name: name == "gsstream-lab")
+    monkeypatch.setattr(install_hints, "_is_installed", lambda name: name == "gsstream-lab")
     words = shlex.split(install("gsstream[s2gs,video]"))
     folders = [word for before, word in itertools.pairwise(words) if before == "-e"]
     assert folders == [f"{ROOT}[s2gs,video]", *(str(ROOT / "plugins" / name) for name in ("cpu_render", "s2gs"))]
     assert all((Path(folder.partition("[")[0]) / "pyproject.toml").is_file() for folder in folders)
     assert install("gsstream-gsplat-render[cuda]").endswith(f"-e '{ROOT / 'plugins' / 'gsplat_render[cuda]'}'")
     assert install("gsstream[video]").endswith("install 'gsstream[video]'"), "every index has PyAV"
-    monkeypatch.setattr(needs, "SOURCES", tmp_path)
+    monkeypatch.setattr(install_hints, "SOURCES", tmp_path)
     assert "install --find-links DIST 'gsstream[s2gs]', where DIST is the folder of wheels" in install("gsstream[s2gs]")
-    monkeypatch.setattr(needs, "ON_INDEX", True)
+    monkeypatch.setattr(install_hints, "ON_INDEX", True)
     assert install("gsstream[s2gs]").endswith("install 'gsstream[s2gs]'")
 
 

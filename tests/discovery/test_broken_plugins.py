@@ -57,7 +57,7 @@ def test_asking_for_a_quarantined_part_raises_from_the_original_error(lab, fault
     lab.install(fault)
     code = (
         "import sys\n"
-        "from gsstream.plugins.catalog import load_catalog\n"
+        "from gsstream.discovery.catalog import load_catalog\n"
         "from gsstream.core.errors import PluginUnavailable\n"
         "try: load_catalog().resolve('gate', sys.argv[1])\n"
         "except PluginUnavailable as error: print(type(error.__cause__).__name__, error)\n"

@@ -7,8 +7,8 @@ import pytest
 from gsstream.core.errors import PluginUnavailable, UnknownName
 from gsstream.core.kinds import CONTRACTS
 from gsstream.core.versions import version_problem
-from gsstream.plugins.catalog import load_catalog
-from gsstream.plugins.discovery import Discovered, PluginFault, discover
+from gsstream.discovery.catalog import load_catalog
+from gsstream.discovery.discovery import Discovered, PluginFault, discover
 from gsstream.spec import ComponentSpec, MethodSpec
 
 
@@ -32,8 +32,17 @@ def test_every_built_in_declaration_holds(builtin) -> None:
 def test_every_slot_has_a_built_in_part(builtin) -> None:
     assert {kind for kind in CONTRACTS if builtin.names(kind)} == set(CONTRACTS)
     assert builtin.names("source") == [
-        "colmap", "demo", "enerf", "folder", "meetroom", "n3dv", "nerfstudio", "panoptic", "synthetic", "watch",
-    ]  # fmt: skip
+        "colmap",
+        "demo",
+        "enerf",
+        "folder",
+        "meetroom",
+        "n3dv",
+        "nerfstudio",
+        "panoptic",
+        "synthetic",
+        "watch",
+    ]
     assert not builtin.quarantine
 
 

@@ -24,13 +24,15 @@ import pydantic
 from gsstream import API_VERSION, __version__
 from gsstream.core.errors import PluginUnavailable, suggest
 from gsstream.core.versions import version_problem
-from gsstream.plugins import builtin, hookspecs
+from gsstream.discovery import builtin, hookspecs
 from gsstream.spec import ENTRY_POINT_GROUP, CommandSpec, ComponentSpec, MethodSpec
 
 Spec = ComponentSpec | MethodSpec | CommandSpec
 HOOKS: dict[str, type[Spec]] = {
-    "gsstream_components": ComponentSpec, "gsstream_methods": MethodSpec, "gsstream_commands": CommandSpec,
-}  # fmt: skip
+    "gsstream_components": ComponentSpec,
+    "gsstream_methods": MethodSpec,
+    "gsstream_commands": CommandSpec,
+}
 
 #: Seconds after which a plugin that is still being imported is named.
 SLOW = 5.0
@@ -123,8 +125,9 @@ def _warn_slow(name: str, distribution: str) -> None:
     print(
         f"gsstream: the plugin {name!r} (from {distribution}) has been loading for {SLOW:g} seconds; "
         "GSSTREAM_LOAD_PLUGINS=OTHER,NAMES leaves it out",
-        file=sys.stderr, flush=True,
-    )  # fmt: skip
+        file=sys.stderr,
+        flush=True,
+    )
 
 
 def _message(error: BaseException) -> str:

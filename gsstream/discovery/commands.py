@@ -8,7 +8,7 @@ import typer
 from typer.main import get_command
 
 from gsstream.core.errors import PluginUnavailable
-from gsstream.plugins.catalog import Catalog
+from gsstream.discovery.catalog import Catalog
 from gsstream.spec import CommandSpec
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from gsstream.core.errors import PluginUnavailable, UnknownName
+from gsstream.core.install_hints import install_part
 from gsstream.core.kinds import PART_KINDS
-from gsstream.core.needs import install_part
-from gsstream.plugins.discovery import Discovered, PluginFault, Spec, discover, spec_key
+from gsstream.discovery.discovery import Discovered, PluginFault, Spec, discover, spec_key
 from gsstream.spec import CommandSpec, ComponentSpec, MethodSpec
 
 
@@ -28,7 +28,7 @@ class Entry:
 
     @property
     def origin(self) -> str:
-        """"distribution version", for listings and errors."""
+        """ "distribution version", for listings and errors."""
         return f"{self.distribution} {self.version}"
 
 

@@ -175,7 +175,13 @@ def encoder_for_rig(
     """
     world = rig_similarity(cameras)
     info = SourceInfo(
-        name, f"rig:{name}", None, fps, snap_cameras(world.inverse_cameras(cameras)), cameras.select([]), world=world
+        name=name,
+        uri=f"rig:{name}",
+        num_frames=None,
+        fps=fps,
+        train=snap_cameras(world.inverse_cameras(cameras)),
+        test=cameras.select([]),
+        world=world,
     )
     return Encoder(_assembled(method, settings, parts), info, transform_cameras=True)
 

@@ -67,7 +67,9 @@ class _Finder:
     def add(self, start: int, end: int, after: str) -> None:
         """Note a change."""
         line = self.data.count(b"\n", 0, start) + 1
-        self.found.append(Change(self.path, line, start, end, self.data[start:end].decode(), after))
+        self.found.append(
+            Change(path=self.path, line=line, start=start, end=end, before=self.data[start:end].decode(), after=after)
+        )
 
     def operator(self, operator: ast.AST, left: ast.expr, right: ast.expr) -> None:
         """Swap what stands between two operands."""

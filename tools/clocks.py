@@ -41,7 +41,7 @@ def main() -> None:
     for name in asked.cameras or thumbs.cameras.ids[1:2]:
         for shift in asked.shifts:
             began = time.perf_counter()
-            found = check_sync(_shifted(thumbs, name, shift, begin, asked.frames))
+            found = check_sync(_shifted(thumbs, name, shift, begin=begin, frames=asked.frames))
             print(f"| {name} | {shift:+d} | {_told(found)} | {time.perf_counter() - began:.1f} |", flush=True)
 
 

@@ -199,7 +199,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if wanted.fps <= 0 or wanted.frames < 1:
         raise InputError(f"expected --fps above 0 and --frames of at least 1, got {wanted.fps:g} and {wanted.frames}")
     finished = DEMO_FOLDER if wanted.source == "demo" else Path(wanted.source)
-    found = drill(finished, wanted.out, wanted.fps, wanted.frames, wanted.watch, given[place + 1 :])
+    found = drill(
+        finished, wanted.out, wanted.fps, frames=wanted.frames, watch=wanted.watch, options=given[place + 1 :]
+    )
     text = json.dumps(found, indent=1)
     (wanted.out / "drill.json").write_text(text + "\n", encoding="utf-8")
     print(text)

@@ -106,7 +106,7 @@ def compare(options: argparse.Namespace, method: str, name: str, world: World, f
     for _ in range(options.repeat):
         for side in found:
             frames = 1 if first is None else world.frames
-            trouble = encode(getattr(options, side), method, world, frames, runs[side], first)
+            trouble = encode(getattr(options, side), method, world, frames=frames, out=runs[side], first=first)
             if trouble:
                 return {"world": name, "method": label, "failed": side, "message": trouble}
             found[side].append(numbers(runs[side], first is None))
@@ -141,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             start = options.out / name / "frame-0" / "before" / "stream.gss"
             for method in (None, *options.methods):
                 first = None if method is None else start
-                row = compare(options, method or "s2gs-edge", name, known[name], first)
+                row = compare(options, method or "s2gs-edge", name, world=known[name], first=first)
                 equal &= row.get("difference") == ""
                 log.write(json.dumps(row) + "\n")
                 log.flush()

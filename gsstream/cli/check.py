@@ -151,7 +151,7 @@ def _config(cls: type[Any], settings: list[str]) -> Any:
         path, leaf = read_override(text)
         values = with_values(values, {".".join(path): leaf.value})
     problems: list[str] = []
-    config = validate(cls.Config, values, lambda _: Origin("command line", "--set"), (), problems)
+    config = validate(cls.Config, values, lambda _: Origin("command line", "--set"), prefix=(), problems=problems)
     join_problems(problems, f"the settings of {cls.__name__}")
     return config
 

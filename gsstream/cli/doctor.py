@@ -197,12 +197,20 @@ def _self_test(renderer: PlayerRenderer) -> tuple[bool, str]:
     K = np.array([[[150.0, 0, 80], [0, 150.0, 60], [0, 0, 1]]])
     viewmat = np.eye(4)[None].copy()
     viewmat[0, 2, 3] = 4.0
-    rig = Cameras(("self-test",), viewmat, K, 160, 120, 0.01)
+    rig = Cameras(ids=("self-test",), viewmats=viewmat, Ks=K, width=160, height=120, near_plane=0.01)
     shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (0, 3)}
     arrays = {name: rng.normal(size=(number, *shape)).astype(np.float32) for name, shape in shapes.items()}
     arrays["scales"] -= 3
     try:
-        meta = StreamMeta("doctor", "self-test", {}, rig, rig.select([]), 30.0, (0.0, 0.0, 0.0))
+        meta = StreamMeta(
+            method="doctor",
+            source="self-test",
+            recipe={},
+            train=rig,
+            test=rig.select([]),
+            fps=30.0,
+            background=(0.0, 0.0, 0.0),
+        )
         packet = encode_key(KeyState(Gaussians(**arrays), Layout.flat(number, 1.0), meta))
         scene = decode_key(packet.data).gaussians
         start = time.perf_counter()

@@ -81,12 +81,12 @@ def run(
                 with disk_errors(out):
                     result = encode(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first)
             except GsstreamError as error:
-                _what_there_is(error, out, recording, wanted, quiet)
+                _what_there_is(error, out, recording, wanted=wanted, quiet=quiet)
                 raise
             except KeyboardInterrupt:
                 raise typer.Exit(128 + came[0] if came else 130) from None
             with disk_errors(out):
-                _pictures(result, recording, wanted, quiet, assembly.recipe.renderer.name == "reference")
+                _pictures(result, recording, wanted, quiet=quiet, warned=assembly.recipe.renderer.name == "reference")
     finally:
         recording.close()
     if result.interrupted:
@@ -149,7 +149,7 @@ def _what_there_is(
         done = last_written(out / METRICS) + 1 if (out / METRICS).exists() else 0
         if done == 0:
             return
-        _pictures(RunResult(out, done, False), recording, wanted, quiet, True)
+        _pictures(RunResult(out, done, False), recording, wanted, quiet=quiet, warned=True)
     except (GsstreamError, OSError) as trouble:
         error.add_note(f"its pictures could not be made: {trouble}")
         return

@@ -59,9 +59,11 @@ def prepare(
 
     began = time.perf_counter()
     model = lens.upper().replace("-", "_")
-    options = PrepareOptions(tuple(test) if test else None, model, each, frames, width, fps=fps)
+    options = PrepareOptions(
+        test=tuple(test) if test else None, model=model, each=each, frames=frames, width=width, fps=fps
+    )
     with working("reading pictures", quiet) as display:
-        made = make(raw, out, options, lambda line: None if quiet else typer.echo(line), display.tell)
+        made = make(raw, out, options, say=lambda line: None if quiet else typer.echo(line), tell=display.tell)
         display.tell("checking the scene")
         # The features have just been matched; how well they fit is in the report.
         found = find(lambda scale: open_source(str(out), scale), features=False)

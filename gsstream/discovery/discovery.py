@@ -84,7 +84,7 @@ def discover() -> list[Discovered]:
             found.append(_inspect(point.name, distribution, version, point.load))
     for name in sorted((allowed or set()) - seen):
         missing = PluginFault(f"named in GSSTREAM_LOAD_PLUGINS but not installed{suggest(name, seen)}")
-        found.append(Discovered(name, "?", "?", None, missing))
+        found.append(Discovered(name=name, distribution="?", version="?", specs=None, error=missing))
     return found
 
 
@@ -114,7 +114,9 @@ def _inspect(name: str, distribution: str, version: str, load: Any) -> Discovere
     except KeyboardInterrupt:
         raise  # Ctrl-C: a plugin that raises KeyboardInterrupt cannot be told from a user who presses it
     except BaseException as error:  # containing whatever a plugin raises is the purpose of this function
-        return Discovered(name, distribution, version, None, error, tuple(declared))
+        return Discovered(
+            name=name, distribution=distribution, version=version, specs=None, error=error, declared=tuple(declared)
+        )
     finally:
         late.cancel()
     return Discovered(name, distribution, version, tuple(declared))

@@ -128,13 +128,26 @@ def sheet_of_stream(
         first = source.frame(playback.frames[0], split).images[place]
         for frame in frames:
             state = playback.player_state(frame)
-            image = np.clip(render(state.gaussians, rig, 0, meta.background, renderer), 0, 1)
+            image = np.clip(render(state.gaussians, rig, 0, background=meta.background, renderer=renderer), 0, 1)
             truth = source.frame(frame, split).images[place]
             painted = paint_gates(state)
-            active = None if frame == playback.frames[0] else render(painted, rig, 0, (0.0, 0.0, 0.0), renderer)
+            active = (
+                None
+                if frame == playback.frames[0]
+                else render(painted, rig, 0, background=(0.0, 0.0, 0.0), renderer=renderer)
+            )
             alone = _alone(fresh[frame], frame, rig, renderer) if fresh and frame in fresh else None
             title = f"frame {frame}   {psnr(image, truth):.2f} dB"
-            columns.append(Column(title, truth, image, active, alone, most_changed_window(truth, first)))
+            columns.append(
+                Column(
+                    title=title,
+                    truth=truth,
+                    decoded=image,
+                    active=active,
+                    fresh=alone,
+                    close=most_changed_window(truth, first),
+                )
+            )
     out = Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     contact_sheet(columns, f"{meta.title} on {meta.source}, camera {rig.ids[0]}").save(out)
@@ -170,7 +183,9 @@ def _reduced(image: FloatArray | None, factor: int) -> FloatArray | None:
 def _alone(path: Path, frame: int, rig: Cameras, renderer: PlayerRenderer | None) -> FloatArray:
     """What a camera sees of a frame's fresh reconstruction."""
     with Playback(path) as playback:
-        return np.clip(render(playback.state_at(frame), rig, 0, playback.meta.background, renderer), 0, 1)
+        return np.clip(
+            render(playback.state_at(frame), rig, 0, background=playback.meta.background, renderer=renderer), 0, 1
+        )
 
 
 def paint_gates(state: PlayerState) -> Gaussians[FloatArray]:
@@ -184,12 +199,12 @@ def paint_gates(state: PlayerState) -> Gaussians[FloatArray]:
     closed, opened = np.array(_CLOSED), np.array(_OPEN)
     color = closed + share[:, None] * (opened - closed)
     return Gaussians(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        ((color - 0.5) / SH0)[:, None].astype(np.float32),
-        np.zeros_like(gaussians.shN),
+        means=gaussians.means,
+        quats=gaussians.quats,
+        scales=gaussians.scales,
+        opacities=gaussians.opacities,
+        sh0=((color - 0.5) / SH0)[:, None].astype(np.float32),
+        shN=np.zeros_like(gaussians.shN),
     )
 
 

@@ -167,7 +167,10 @@ class StreamFrames:
             views = range(len(self.rig))
             self._last = (
                 scene,
-                [np.clip(render(scene, self.rig, view, background, self._with), 0, 1) for view in views],
+                [
+                    np.clip(render(scene, self.rig, view, background=background, renderer=self._with), 0, 1)
+                    for view in views
+                ],
             )
         return self._last[1]
 
@@ -228,11 +231,13 @@ def evaluate_frames(
         truth, images, seen = _truth(source, frame, split, order), shown.images(frame), shown.seen(frame)
         for i, name in enumerate(rig.ids):
             masks = (moving_mask(truth[i], truth_first[i], sigmas[i]), changed_mask(truth[i], truth_first[i]))
-            pair = ViewPair(images[i], truth[i], last[0][i], last[1][i], sigmas[i])
+            pair = ViewPair(
+                image=images[i], truth=truth[i], last_image=last[0][i], last_truth=last[1][i], sigma=sigmas[i]
+            )
             found = {key: metric(pair) for key, metric in (extras or {}).items()}
-            quality = _compare(frame, name, pair, held[i], masks, lpips)
+            quality = _compare(frame, name, pair, held=held[i], masks=masks, lpips=lpips)
             if seen is not None:
-                quality = _with_seen(quality, pair, held[i], masks[1], seen[i])
+                quality = _with_seen(quality, pair, held[i], changed=masks[1], seen=seen[i])
             views.append(replace(quality, extra=found))
         last = (images, list(truth))
         if progress is not None:

@@ -61,7 +61,10 @@ class PlySequence:
     def images(self, frame: int) -> list[FloatArray]:
         """Return what the test cameras see of a frame."""
         scene, views = self._scene(frame), range(len(self.rig))
-        return [np.clip(render(scene, self.rig, view, self._background, self._with), 0, 1) for view in views]
+        return [
+            np.clip(render(scene, self.rig, view, background=self._background, renderer=self._with), 0, 1)
+            for view in views
+        ]
 
     def seen(self, frame: int) -> list[BoolArray]:
         """Return the pixels of the test cameras whose surface the recording's training cameras see."""

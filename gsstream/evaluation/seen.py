@@ -38,7 +38,7 @@ def draw_depths(
     colors = np.column_stack([cameras.near_plane / depth, np.ones_like(depth), np.zeros_like(depth)])
     sh0 = ((colors - 0.5) / SH0).astype(np.float32)[:, None]
     shown = replace(scene, sh0=sh0, shN=np.zeros((len(depth), 0, 3), np.float32))
-    image = render(shown, cameras, view, (0.0, 0.0, 0.0), renderer).astype(np.float64)
+    image = render(shown, cameras, view, background=(0.0, 0.0, 0.0), renderer=renderer).astype(np.float64)
     inverse, alpha = image[..., 0] / cameras.near_plane, image[..., 1]
     solid = (alpha >= MIN_ALPHA) & (inverse > 0)
     return np.asarray(np.where(solid, alpha / np.where(solid, inverse, 1), np.inf))

@@ -144,7 +144,13 @@ def stream_stats(stream: str | os.PathLike[str], *, progress: Callable[[int, int
             raise reader.damage
     if state is None:
         raise PacketError("the stream holds no complete packet yet", reader.end)
-    return StreamStats(tuple(packets), len(state.gaussians), len(state.layout.node_counts), raw, state.meta.fps)
+    return StreamStats(
+        packets=tuple(packets),
+        num_gaussians=len(state.gaussians),
+        num_nodes=len(state.layout.node_counts),
+        raw_key_bytes=raw,
+        fps=state.meta.fps,
+    )
 
 
 def _changing(delta: Delta | None) -> int:

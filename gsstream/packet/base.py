@@ -149,7 +149,7 @@ def build_packet(kind: PacketKind, frame: int, sections: Sequence[tuple[str, byt
     if len(body) > MAX_BODY or not 0 <= frame < 1 << 32:
         raise PacketError(f"packet of frame {frame}: {len(body)} bytes; expected at most {MAX_BODY} and a 32-bit frame")
     checksum = zlib.crc32(body, zlib.crc32(struct.pack("<BBII", kind, len(sections), frame, len(body))))
-    check = _header_check(kind, len(sections), frame, len(body), checksum)
+    check = _header_check(kind, len(sections), frame, body=len(body), checksum=checksum)
     header = PACKET_HEADER.pack(kind, len(sections), check, frame, len(body), checksum)
     sizes = {name: len(data) for name, data in sections}
     sizes["header"] = len(header) + SECTION_HEADER.size * len(sections)
@@ -166,13 +166,13 @@ def parse_header(data: bytes, offset: int) -> PacketHeader:
     if len(data) < PACKET_HEADER.size:
         raise PacketError(f"packet header cut short: expected {PACKET_HEADER.size} bytes, got {len(data)}", offset)
     kind, sections, check, frame, body, checksum = PACKET_HEADER.unpack_from(data)
-    if check != _header_check(kind, sections, frame, body, checksum):
+    if check != _header_check(kind, sections, frame, body=body, checksum=checksum):
         raise PacketError("packet header damaged: its check does not match", offset)
     if kind not in PacketKind._value2member_map_:
         raise PacketError(f"unknown packet type {kind}; expected {[int(k) for k in PacketKind]}", offset)
     if sections > MAX_SECTIONS or body > MAX_BODY or body < sections * SECTION_HEADER.size:
         raise PacketError(f"packet header impossible: {sections} sections in {body} bytes", offset)
-    return PacketHeader(PacketKind(kind), sections, frame, body, checksum)
+    return PacketHeader(kind=PacketKind(kind), sections=sections, frame=frame, body=body, checksum=checksum)
 
 
 def parse_packet(data: bytes, offset: int = 0) -> tuple[PacketHeader, dict[str, Section]]:

@@ -187,7 +187,14 @@ def _cameras(value: Any) -> Cameras:
     ids = tuple(_text(name) for name in value["ids"])
     viewmats = np.asarray(value["viewmats"], np.float64).reshape(len(ids), 4, 4)
     Ks = np.asarray(value["Ks"], np.float64).reshape(len(ids), 3, 3)
-    cameras = Cameras(ids, viewmats, Ks, _whole(value["width"]), _whole(value["height"]), _number(value["near"]))
+    cameras = Cameras(
+        ids=ids,
+        viewmats=viewmats,
+        Ks=Ks,
+        width=_whole(value["width"]),
+        height=_whole(value["height"]),
+        near_plane=_number(value["near"]),
+    )
     cameras.validate()
     return cameras
 

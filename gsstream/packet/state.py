@@ -74,4 +74,12 @@ def decode_packet(state: PlayerState | None, data: bytes, *, offset: int = 0) ->
     except ShapeError as error:
         raise PacketError(str(error), offset) from error
     decoders = next_decoders(state.decoders, delta)
-    return PlayerState(header.frame, scene, state.meta, decoders, delta, state.layout, state.key_rows)
+    return PlayerState(
+        frame=header.frame,
+        scene=scene,
+        meta=state.meta,
+        decoders=decoders,
+        delta=delta,
+        before=state.layout,
+        key_rows=state.key_rows,
+    )

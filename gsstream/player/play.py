@@ -70,7 +70,7 @@ def play(
         if playback.limit is not None:
             kept = len(times) if Path(out).suffix.lower() in _ANIMATED else 1
             playback.limit.check_pictures(cameras.width, cameras.height, kept)
-        images = _images(playback, times, cameras, renderer, progress)
+        images = _images(playback, times, cameras, renderer=renderer, progress=progress)
         try:
             played = write_pictures(Path(out), images, chosen if fps is None else range(len(times)), rate)
         except OSError as error:
@@ -125,7 +125,7 @@ def _images(
         scene, view = scenes.at(time), min(i, len(cameras) - 1)
         # An empty packet keeps the very same scene object: nothing has to be rendered again.
         if last is None or last[0] is not scene or last[1] != view:
-            last = (scene, view, render(scene, cameras, view, background, renderer))
+            last = (scene, view, render(scene, cameras, view, background=background, renderer=renderer))
         yield to_bytes(last[2])
         if progress is not None:
             progress(i + 1, len(times))

@@ -77,19 +77,19 @@ def recorded_region(rig: Cameras) -> Region:
     """Return the region of a rig of at least one camera. No camera of the rig is outside."""
     focus, outward = _focus(rig)
     up = up_direction(rig)
-    region = Region(focus, up, outward, None, (0.0, 0.0), (0.0, 0.0))
+    region = Region(focus=focus, up=up, outward=outward, azimuth=None, elevation=(0.0, 0.0), distance=(0.0, 0.0))
     arms = region.arms(rig)
     azimuth, elevation = region.angles(arms)
     level = np.abs(arms @ up) < STEEP
     distance = np.linalg.norm(rig.centers - focus, axis=1)
     middle, half = (elevation.max() + elevation.min()) / 2, max((elevation.max() - elevation.min()) / 2, MIN_SWING)
     return Region(
-        focus,
-        up,
-        outward,
-        _arc(azimuth[level]) if level.any() else None,
-        (float(middle - half), float(middle + half)),
-        (float(NEAREST * distance.min()), float(FARTHEST * distance.max())),
+        focus=focus,
+        up=up,
+        outward=outward,
+        azimuth=_arc(azimuth[level]) if level.any() else None,
+        elevation=(float(middle - half), float(middle + half)),
+        distance=(float(NEAREST * distance.min()), float(FARTHEST * distance.max())),
     )
 
 

@@ -35,14 +35,16 @@ def render_numpy(
     points = means.astype(np.float64) @ viewmat[:3, :3].T + viewmat[:3, 3]
     front = np.flatnonzero(points[:, 2] > near)
     front = front[np.argsort(points[front, 2], kind="stable")]
-    means2d, covariance = _project(points[front], quats[front], scales[front], viewmat, K, width, height)
+    means2d, covariance = _project(
+        points[front], quats[front], scales[front], viewmat=viewmat, K=K, width=width, height=height
+    )
     with np.errstate(over="ignore"):
         opacity = 1 / (1 + np.exp(-opacities[front].astype(np.float64)))
     colors = _colors(sh0[front], shN[front], means[front].astype(np.float64) - center)
     image = np.empty((height, width, 3), np.float32)
     image[:] = background
     table = np.column_stack([means2d, _conics(covariance), opacity, colors])
-    rows, tiles = _tile_lists(means2d, covariance, opacity, width, height)
+    rows, tiles = _tile_lists(means2d, covariance, opacity, width=width, height=height)
     columns = -(-width // TILE)
     starts = np.flatnonzero(np.diff(tiles, prepend=-1))
     # With no pair at all `starts` is empty and the background stays.

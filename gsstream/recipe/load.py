@@ -139,7 +139,7 @@ def stack(layers: Sequence[Layer]) -> ResolvedRecipe:
             elif "params" in path[:-1] and not any(p[: len(path)] == path for p in merged):
                 _put(merged, path, Leaf({}, leaf.origin))  # a part's setting may be a mapping without entries
     origins = {path: leaf.origin for path, leaf in merged.items()}
-    recipe = validate(Recipe, _nest(merged), ResolvedRecipe(Recipe(), origins).near, (), problems)
+    recipe = validate(Recipe, _nest(merged), ResolvedRecipe(Recipe(), origins).near, prefix=(), problems=problems)
     join_problems(problems)
     assert recipe is not None, "an invalid recipe leaves at least one problem"
     return ResolvedRecipe(recipe, origins)

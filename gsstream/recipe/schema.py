@@ -39,7 +39,7 @@ def recipe_schema(parts: Mapping[str, Mapping[str, PartSchema]], resolved: Resol
     properties = schema["properties"]
     for slot in slots():
         default = getattr(resolved.recipe, slot).name if resolved else None
-        properties[slot] = _slot(slot, properties[slot], parts.get(slot, {}), default, definitions)
+        properties[slot] = _slot(slot, properties[slot], parts.get(slot, {}), default=default, definitions=definitions)
     properties["base"] = {
         "type": "string",
         "description": "name of a method, or a file beside this one, that this file changes",

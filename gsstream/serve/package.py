@@ -84,7 +84,14 @@ def package(
         raise
     segments = {s["file"]: s["bytes"] for entry in (main, *others) for s in entry["segments"]}
     joins = {j["file"]: j["bytes"] for entry in (main, *others) for s in entry["segments"] for j in s["joins"]}
-    return Package(folder, len(segments), len(joins), sum(segments.values()), sum(joins.values()), size)
+    return Package(
+        folder=folder,
+        segments=len(segments),
+        joins=len(joins),
+        stream_bytes=sum(segments.values()),
+        join_bytes=sum(joins.values()),
+        player_bytes=size,
+    )
 
 
 def _files(manifest: dict[str, Any]) -> set[str]:

@@ -43,14 +43,14 @@ def all_equal(
     """Apply :func:`equal` to every named tensor; the names must agree too."""
     assert set(got) == set(expected), f"{what}: expected the outputs {sorted(expected)}, got {sorted(got)}"
     for name, value in expected.items():
-        equal(f"{what}: {name}", got[name], value, tolerance, why)
+        equal(f"{what}: {name}", got[name], value, tolerance=tolerance, why=why)
 
 
 def relative(what: str, got: torch.Tensor, expected: torch.Tensor, tolerance: float, why: str, *, floor: float) -> None:
     """Apply :func:`equal` to fractions of the largest expected value, which is taken to be at least ``floor``."""
     assert floor > 0, f"{what}: expected a floor above 0, got {floor}"
     scale = max(float(expected.abs().max()), floor) if expected.numel() else 1.0
-    equal(f"{what}, as fractions of {scale:.3g}", got / scale, expected / scale, tolerance, why)
+    equal(f"{what}, as fractions of {scale:.3g}", got / scale, expected / scale, tolerance=tolerance, why=why)
 
 
 def gradients_equal(
@@ -61,7 +61,7 @@ def gradients_equal(
     largest = max(float(value.abs().max()) for value in expected.values() if value.numel())
     assert largest > 0, f"{what}: every expected gradient is 0, so nothing would be compared"
     for name, value in expected.items():
-        relative(f"{what}: gradient of {name}", got[name], value, tolerance, why, floor=FLOOR * largest)
+        relative(f"{what}: gradient of {name}", got[name], value, tolerance=tolerance, why=why, floor=FLOOR * largest)
 
 
 def at_most(what: str, got: torch.Tensor, bound: torch.Tensor | float, tolerance: float, why: str) -> None:

@@ -52,7 +52,7 @@ def check(kind: str, trait: str | None = None, kinds: tuple[str, ...] | None = N
     def register(function: CheckFunction) -> CheckFunction:
         name = function.__name__
         assert name.startswith("check_") and name not in CHECKS, name
-        CHECKS[name] = Check(name, kind, kinds or (kind,), trait, function)
+        CHECKS[name] = Check(name=name, kind=kind, kinds=kinds or (kind,), trait=trait, function=function)
         return function
 
     return register

@@ -51,7 +51,7 @@ def fit_fixture(*, changed: bool = True) -> FitFixture:
     if not changed:
         change = Change(torch.zeros_like(change.tiles), change.height, change.width)
     frame = replace(frame, index=INDEX, cameras=state.previous.cameras)
-    view = EngineContext(method.assembly, state, frame, FrameLog(), change)
+    view = EngineContext(assembly=method.assembly, state=state, frame=frame, log=FrameLog(), change=change)
     return FitFixture(state.player.scene, view, Rng(method.assembly.recipe.seed))
 
 

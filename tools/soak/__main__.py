@@ -43,13 +43,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     given.out.mkdir(parents=True, exist_ok=True)
     if given.only is not None:
-        record = work(given.seed, given.only, None, given.limit, given.out)
+        record = work(given.seed, given.only, None, limit=given.limit, out=given.out)
         print(record["command"], record["outcome"]["problem"] or json.dumps(record["outcome"]), sep="\n")
         return int(record["outcome"]["status"] == "failed")
     if given.worker:
-        work(given.seed, given.first, time.time() + 60 * given.minutes, given.limit, given.out)
+        work(given.seed, given.first, time.time() + 60 * given.minutes, limit=given.limit, out=given.out)
         return 0
-    supervise(given.seed, given.first, time.time() + 60 * given.minutes, given.limit, given.out)
+    supervise(given.seed, given.first, time.time() + 60 * given.minutes, limit=given.limit, out=given.out)
     summary = summarise(read_runs(given.out))
     (given.out / SUMMARY).write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
     print(json.dumps(summary, indent=1))

@@ -64,7 +64,7 @@ def run_case(case: Case, catalog: Catalog, out: Path) -> Outcome:
         return Outcome("refused", f"{type(error).__name__}: {error}")
     digests: list[str] = []
     try:
-        found = _encode_and_check(case, parts, catalog, out, digests)
+        found = _encode_and_check(case, parts, catalog, out=out, digests=digests)
     except Exception as error:  # whatever it is, the soak goes on and its record says so
         problem = f"{type(error).__name__}: {error}\n{traceback.format_exc()}"
         asked = isinstance(error, InputError) and not isinstance(error, ShapeError) and not digests
@@ -112,7 +112,9 @@ def _play(stream: Path, digests: list[str], salt: int) -> int:
                 _finite(value, f"{name} of frame {frame}")
         last = state.gaussians
         for camera in range(len(playback.cameras("test"))):
-            shown = render(last, playback.cameras("test"), camera, playback.meta.background, find_renderer())
+            shown = render(
+                last, playback.cameras("test"), camera, background=playback.meta.background, renderer=find_renderer()
+            )
             _finite(shown, f"picture of test camera {camera}")
     with Playback(stream) as playback:
         for frame in np.random.default_rng(salt).permutation(len(digests))[:4].tolist():

@@ -122,7 +122,7 @@ def apply_field(scene: Scene, change: Field) -> tuple[Scene, IntArray]:
         start + symbols.astype(np.int64) * change.weight_step
         for start, symbols in zip(shape.start_weights(), change.weights, strict=True)
     ]
-    said = evaluate_network(shape, unit, touched, entries, weights)
+    said = evaluate_network(shape, unit, touched, entries=entries, weights=weights)
     gaussians = scene.gaussians
     # By the limits of weights and reach no shift is above 10^15, so what is finite stays so.
     there = gaussians.means.take(rows, 0).astype(np.float64) + said[:, :3] * shape.reach

@@ -151,7 +151,7 @@ def predict_transforms(scene: Scene, groups: Groups, moving: IntArray, predicted
         past = past.take(here)
         translation = _means(scene.displacement.translation.take(here, 0), past, len(which))
         rotation = _means(scene.displacement.rotation.take(here, 0), past, len(which))
-    return GroupTransforms(rows, group, center, translation, rotation)
+    return GroupTransforms(rows=rows, group=group, center=center, translation=translation, rotation=rotation)
 
 
 def apply_motion(scene: Scene, motion: Motion) -> tuple[Scene, IntArray]:

@@ -125,11 +125,11 @@ def assemble(
         if slot in live:
             built: Part | None = live[slot]
         elif slot == "renderer" and ref.name == "auto":
-            chosen = _choose(ref, resolved, catalog, problems, parts)
+            chosen = _choose(ref, resolved, catalog, problems=problems, parts=parts)
             ref = ComponentRef(name=chosen.name) if chosen else ref
             built, note = (chosen.renderer, chosen.note) if chosen else (None, "")
         else:
-            built = _build(slot, ref, resolved, catalog, problems)
+            built = _build(slot, ref, resolved, catalog=catalog, problems=problems)
         if built is not None:
             parts[slot] = built
             refs[slot] = ComponentRef(name=ref.name, params=built.config.model_dump(mode="json"))
@@ -195,8 +195,8 @@ def _build(
     except UnknownName as error:
         problems.append(f"{resolved.near((slot, 'name')).where}: {slot}.name: {error}")
         return None
-    config = validate(cls.Config, ref.params, resolved.near, (slot, "params"), problems)
-    return None if config is None else construct(slot, ref.name, cls, config, catalog)
+    config = validate(cls.Config, ref.params, resolved.near, prefix=(slot, "params"), problems=problems)
+    return None if config is None else construct(slot, ref.name, cls, config=config, catalog=catalog)
 
 
 def _loss(resolved: ResolvedRecipe, catalog: Catalog, problems: list[str], compiled: bool) -> Part | None:
@@ -206,7 +206,7 @@ def _loss(resolved: ResolvedRecipe, catalog: Catalog, problems: list[str], compi
     for name in automatic if wanted == "auto" else (wanted,):
         try:
             cls = catalog.resolve("loss", name)
-            return construct("loss", name, cls, cls.Config(), catalog)
+            return construct("loss", name, cls, config=cls.Config(), catalog=catalog)
         except (UnknownName, PluginUnavailable) as error:
             if wanted != "auto":
                 problems.append(f"{resolved.near(('loss', 'backend')).where}: loss.backend: {error}")
@@ -218,11 +218,11 @@ def _optimiser(catalog: Catalog, compiled: bool) -> Part:
     if compiled:
         try:
             cls = catalog.resolve("optimiser", COMPILED)
-            return construct("optimiser", COMPILED, cls, cls.Config(), catalog)
+            return construct("optimiser", COMPILED, cls, config=cls.Config(), catalog=catalog)
         except (UnknownName, PluginUnavailable):
             pass  # what keeps a plugin from working is shown where its renderer is chosen
     cls = catalog.resolve("optimiser", REFERENCE)
-    return construct("optimiser", REFERENCE, cls, cls.Config(), catalog)
+    return construct("optimiser", REFERENCE, cls, config=cls.Config(), catalog=catalog)
 
 
 def _processor_only(parts: Mapping[str, Part]) -> str:

@@ -61,7 +61,7 @@ def choose_renderer(catalog: Catalog, processor_only: str = "") -> Chosen:
         return Chosen(COMPILED, renderer, note)
     _warn_slow(catalog, renderer)
     cls = catalog.resolve("renderer", "reference")
-    return Chosen("reference", construct("renderer", "reference", cls, cls.Config(), catalog), note)
+    return Chosen("reference", construct("renderer", "reference", cls, config=cls.Config(), catalog=catalog), note)
 
 
 def _on_gpu(catalog: Catalog, device: str, processor_only: str) -> Chosen | str:
@@ -85,7 +85,7 @@ def _tried(catalog: Catalog, name: str, absent: str, **settings: str) -> Part | 
     """The renderer, or why it does not work here; ``absent`` where no plugin declares it."""
     try:
         cls = catalog.resolve("renderer", name)
-        return construct("renderer", name, cls, cls.Config(**settings), catalog)
+        return construct("renderer", name, cls, config=cls.Config(**settings), catalog=catalog)
     except UnknownName:
         return absent
     except PluginUnavailable as error:

@@ -178,7 +178,13 @@ def scheduled(stream: Stream, frame: Frame, budget: FrameBudget | None) -> Sched
     if budget is None:
         return Schedule(epochs, stream.rd_lambda)
     assert isinstance(budget, Allowance)
-    return EpochScheduler(budget, epochs, stream.rd_lambda, len(frame.cameras), frame.epoch_scale)
+    return EpochScheduler(
+        allowance=budget,
+        epochs=epochs,
+        rd_lambda=stream.rd_lambda,
+        views=len(frame.cameras),
+        epoch_scale=frame.epoch_scale,
+    )
 
 
 def next_rate_weight(weight: float, expected: float, wanted: float) -> float:

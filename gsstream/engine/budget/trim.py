@@ -55,11 +55,11 @@ def trim_to_size(
     if untrimmed <= max_bytes:
         return TrimmedDelta(delta, packet, untrimmed)
     able = delta.residual is not None and delta.residual.symbols
-    found = _trimmed(delta, packet, curvature, layout, encode, max_bytes) if able else None
+    found = _trimmed(delta, packet, curvature, layout=layout, encode=encode, max_bytes=max_bytes) if able else None
     if found is None and delta.has_row_edit:
         # Added Gaussians cost most per row, so they are dropped first: without them the rest may fit.
         rest = delta.with_row_edit(None)
-        plain = trim_to_size(rest, encode(rest), curvature, layout, encode, max_bytes)
+        plain = trim_to_size(rest, encode(rest), curvature, layout=layout, encode=encode, max_bytes=max_bytes)
         return replace(plain, untrimmed=untrimmed, added=0 if delta.added is None else len(delta.added))
     if found is None:
         found = Delta(), encode(Delta())

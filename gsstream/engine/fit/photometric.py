@@ -29,7 +29,14 @@ class PhotometricLoss:
         if view not in self._prepared:
             self._prepared[view] = self._loss.prepare(image if self._takes_bytes else self.images[view])
         exposure = self.exposure[view] if self.exposure else None
-        return ViewTarget(self._loss, self._prepared[view], self._dssim, image, exposure, tile_weights)
+        return ViewTarget(
+            loss=self._loss,
+            prepared=self._prepared[view],
+            dssim=self._dssim,
+            image=image,
+            exposure=exposure,
+            tile_weights=tile_weights,
+        )
 
 
 def render_exposed(

@@ -46,16 +46,18 @@ def begin(assembly: Assembly, frame: Frame, tools: Tools) -> Step:
         start, levels = initial_gaussians(anchors, assembly.recipe.first_frame), anchors.levels
         if assembly.recipe.first_frame.shell:
             start, levels = with_shell(start, levels, frame)
-        found = optimise_first_frame(start, levels, frame, assembly, rng, tools.progress)
+        found = optimise_first_frame(start, levels, frame, assembly=assembly, rng=rng, progress=tools.progress)
     with log.phase("code"):
         # Positions are float32 in the packet too, so the hierarchy of the decoded scene is the one built here.
-        cheaper = rd_quantise(assembly, found.gaussians, frame, found.exposure, rng)
+        cheaper = rd_quantise(assembly, found.gaussians, frame, exposure=found.exposure, rng=rng)
         decoded = quantise_key(cheaper.map(lambda t: t.numpy())).map(torch.from_numpy)
         hierarchy, levels, decoded = sort_into_nodes(assembly, decoded, found.levels, anchors)
         layout = make_layout(hierarchy, levels, anchors)
-        first = first_layer_mask(assembly, decoded, frame, found.exposure, rng)
+        first = first_layer_mask(assembly, decoded, frame, exposure=found.exposure, rng=rng)
         meta = key_meta(tools.meta(frame), found.exposure, anchors.origin)
-        state, packet = key_state(assembly, decoded, layout, hierarchy, frame, meta, rng, first)
+        state, packet = key_state(
+            assembly, decoded, layout, hierarchy=hierarchy, frame=frame, meta=meta, rng=rng, first=first
+        )
     log.set(iterations=found.iterations)
     return Step(state, packet, "key")
 

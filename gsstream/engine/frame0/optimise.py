@@ -62,7 +62,7 @@ def initial_gaussians(anchors: Anchors, settings: FirstFrame) -> Gaussians[torch
         raise InputError("the structure placed no anchors: expected at least 1 Gaussian to start from, got 0")
     spacing = neighbour_distance(anchors.positions).clamp(1e-6, 1e6)
     higher = (settings.sh_degree + 1) ** 2 - 1
-    return isotropic(anchors.positions, anchors.colors, spacing.log(), constants.OPACITY, higher)
+    return isotropic(anchors.positions, anchors.colors, spacing.log(), opacity=constants.OPACITY, higher=higher)
 
 
 def isotropic(
@@ -110,7 +110,14 @@ def optimise_first_frame(
     iterations = min(settings.epochs * len(frame.cameras), settings.max_iterations)
     pyramid = plan_pyramid(frame.cameras.width, iterations, settings)
     # The name of this random stream is that of older versions, so that a seed still gives the same frame 0.
-    run = FirstFrameRun(start, levels, frame, assembly, rng.stream("root", frame.index), pyramid)
+    run = FirstFrameRun(
+        start=start,
+        levels=levels,
+        frame=frame,
+        assembly=assembly,
+        generator=rng.stream("root", frame.index),
+        pyramid=pyramid,
+    )
     run.exposure = ExposureFit.start(len(frame.cameras), run.device) if settings.exposure else None
     for level in pyramid.levels:
         run.enter(level)
@@ -223,7 +230,7 @@ class FirstFrameRun:
             self.smooth_depth.add_grad(wrt.placed(), view, found.grad, weight)
         self.table.set_lr("means", self.extent * self.level.lr_at(iteration))
         price = self._area_price(iteration)
-        add_penalty_grad(found.grad, scene, self.frame.cameras, view, self.extent, price)
+        add_penalty_grad(found.grad, scene, self.frame.cameras, view=view, extent=self.extent, area_price=price)
         self.table.step(dict(found.grad.items()))
         if found.means2d is not None:
             self.statistics = self.statistics.add(found.means2d * self.half_size)

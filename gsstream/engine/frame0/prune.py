@@ -84,6 +84,8 @@ def prune_by_error(
 def _mean_error(views: TrainingViews, gaussians: Gaussians[torch.Tensor]) -> float:
     cameras, error = views.frame.cameras, 0.0
     for view in range(len(cameras)):
-        seen = render_exposed(views.renderer, gaussians, cameras, view, views.background, views.exposure)
+        seen = render_exposed(
+            views.renderer, gaussians, cameras, view=view, background=views.background, exposure=views.exposure
+        )
         error += views.error(view, seen)
     return error / len(cameras)

@@ -68,7 +68,13 @@ class Pyramid:
 
 def one_size(iterations: int, settings: FirstFrame) -> Pyramid:
     """Return the schedule on pictures of their own size alone."""
-    level = PyramidLevel(1, 0, iterations, settings.lr_means, settings.lr_means / constants.LR_MEANS_FALL)
+    level = PyramidLevel(
+        factor=1,
+        begin=0,
+        iterations=iterations,
+        first_lr=settings.lr_means,
+        last_lr=settings.lr_means / constants.LR_MEANS_FALL,
+    )
     return Pyramid((level,), constants.DENSIFY_UNTIL, constants.PRUNE_AT)
 
 
@@ -86,7 +92,11 @@ def plan_pyramid(width: int, iterations: int, settings: FirstFrame) -> Pyramid:
         first_lr = settings.lr_means * (first if number else 1.0)
         last_lr = 2 * settings.lr_means / constants.LR_MEANS_FALL if last is None else last * settings.lr_means
         begin = levels[-1].end if levels else 0
-        levels.append(PyramidLevel(2 ** (count - 1 - number), begin, share, first_lr, last_lr))
+        levels.append(
+            PyramidLevel(
+                factor=2 ** (count - 1 - number), begin=begin, iterations=share, first_lr=first_lr, last_lr=last_lr
+            )
+        )
     return Pyramid(tuple(levels), constants.PYRAMID_DENSIFY_UNTIL, constants.PYRAMID_PRUNE_AT)
 
 

@@ -38,7 +38,9 @@ def rd_quantise(
     rate = assembly.recipe.codec.key_rd_lambda
     if rate == 0 or len(rows) == 0:
         return rows
-    sensitivity, error = code_sensitivity(assembly, rows, frame, exposure, rng.stream("key rate", frame.index))
+    sensitivity, error = code_sensitivity(
+        assembly, rows, frame, exposure=exposure, generator=rng.stream("key rate", frame.index)
+    )
     return Gaussians(
         means=rows.means,
         **{

@@ -44,7 +44,9 @@ def refine_first_frame(assembly: Assembly, state: StreamState, step: Step, frame
         return step
     with tools.log.phase("refine"):
         after, before = step.state, state.refinement or start_refinement(state.player)
-        found = advance_refinement(assembly, before, state.player, after.player, frame, state.exposure, tools.rng)
+        found = advance_refinement(
+            assembly, before, state.player, after=after.player, frame=frame, exposure=state.exposure, rng=tools.rng
+        )
     tools.log.set(refine_iterations=found.iterations - before.iterations)
     return replace(step, state=replace(after, refinement=found))
 
@@ -77,7 +79,14 @@ def start_refinement(player: PlayerState) -> Refinement:
     gaussians = player.gaussians.map(torch.from_numpy)
     count = len(gaussians)
     levels = torch.from_numpy(player.layout.unit_of.astype(np.int64))
-    return Refinement(gaussians, levels, torch.arange(count), {}, DensifyStatistics.zeros(count, CPU), 0)
+    return Refinement(
+        gaussians=gaussians,
+        levels=levels,
+        ancestors=torch.arange(count),
+        moments={},
+        statistics=DensifyStatistics.zeros(count, CPU),
+        iterations=0,
+    )
 
 
 def advance_refinement(
@@ -95,7 +104,9 @@ def advance_refinement(
         return start
     generator = rng.stream("refine", frame.index)
     pyramid = one_size(_iterations(stream), assembly.recipe.first_frame)
-    run = FirstFrameRun(start.gaussians, start.levels, frame, assembly, generator, pyramid)
+    run = FirstFrameRun(
+        start=start.gaussians, levels=start.levels, frame=frame, assembly=assembly, generator=generator, pyramid=pyramid
+    )
     run.photometric.exposure = None if exposure is None else exposure.to(run.device)
     run.statistics = start.statistics.to(run.device)
     for name, held in start.moments.items():
@@ -106,7 +117,14 @@ def advance_refinement(
     moments = {name: {key: value.to(CPU) for key, value in run.table.moments(name).items()} for name in ATTRIBUTES}
     found = run.gaussians().map(lambda value: value.detach().to(CPU))
     ancestors = start.ancestors[run.came_from.to(CPU)]
-    return Refinement(found, run.levels.to(CPU), ancestors, moments, run.statistics.to(CPU), last)
+    return Refinement(
+        gaussians=found,
+        levels=run.levels.to(CPU),
+        ancestors=ancestors,
+        moments=moments,
+        statistics=run.statistics.to(CPU),
+        iterations=last,
+    )
 
 
 def track_motion(refinement: Refinement, before: PlayerState, after: PlayerState) -> Refinement:

@@ -53,9 +53,11 @@ def reuse_first_frame(assembly: Assembly, frame: Frame, tools: Tools) -> Step:
         hierarchy, levels, gaussians = sort_into_nodes(assembly, gaussians, anchors.levels, anchors)
         layout = make_layout(hierarchy, levels, anchors)
         exposure = exposure_from_meta(first.meta)
-        first_seen = first_layer_mask(assembly, gaussians, frame, exposure, rng)
+        first_seen = first_layer_mask(assembly, gaussians, frame, exposure=exposure, rng=rng)
         meta = key_meta(meta, exposure, anchors.origin)
-        state, packet = key_state(assembly, gaussians, layout, hierarchy, frame, meta, rng, first_seen)
+        state, packet = key_state(
+            assembly, gaussians, layout, hierarchy=hierarchy, frame=frame, meta=meta, rng=rng, first=first_seen
+        )
     tools.log.set(iterations=0)
     return Step(state, packet, "key")
 

@@ -55,7 +55,7 @@ def _by_column(exact: FloatArray, sensitivity: FloatArray, weight: float, candid
     columns = zip(exact.T, nearest.T, sensitivity.T, strict=True)
     return np.stack(
         [
-            _column(values, codes, candidate_codes(codes), sensitivities, weight)
+            _column(values, codes, candidate_codes(codes), sensitivity=sensitivities, weight=weight)
             for values, codes, sensitivities in columns
         ],
         1,

@@ -23,6 +23,6 @@ def with_shell(
     points = shell_points(frame.as_float32().images, frame.cameras)
     scales = torch.full((len(points),), math.log(find_shell(frame.cameras).sigma))
     positions, colors = torch.from_numpy(points.xyz), torch.from_numpy(points.rgb)
-    sphere = isotropic(positions, colors, scales, OPACITY, start.shN.shape[1])
+    sphere = isotropic(positions, colors, scales, opacity=OPACITY, higher=start.shN.shape[1])
     coarsest = torch.full((len(points),), int(levels.min()), dtype=levels.dtype)
     return concat_gaussians(start, sphere), torch.cat([levels, coarsest])

@@ -71,16 +71,28 @@ def refined_key_step(assembly: Assembly, state: StreamState, frame: Frame, meta:
     """Return the refined first frame, as it is now, as a key packet, and the state that follows from its bytes."""
     found = state.refinement
     assert found is not None
-    cheaper = rd_quantise(assembly, found.gaussians, frame, state.exposure, rng)
+    cheaper = rd_quantise(assembly, found.gaussians, frame, exposure=state.exposure, rng=rng)
     gaussians = quantise_key(cheaper.map(lambda t: t.numpy())).map(torch.from_numpy)
-    return _key_step(assembly, state, gaussians, found.levels, frame, frame.index, meta, rng, layered=True)
+    return _key_step(
+        assembly,
+        state,
+        gaussians,
+        levels=found.levels,
+        frame=frame,
+        shown=frame.index,
+        meta=meta,
+        rng=rng,
+        layered=True,
+    )
 
 
 def reencode_as_key(assembly: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
     """Return the current decoded scene as a key packet, and the state that follows from its bytes."""
     gaussians = quantise_key(state.player.gaussians).map(torch.from_numpy)
     levels = decoded_anchors(state.player).levels
-    return _key_step(assembly, state, gaussians, levels, frame, state.previous.index, meta, rng)
+    return _key_step(
+        assembly, state, gaussians, levels=levels, frame=frame, shown=state.previous.index, meta=meta, rng=rng
+    )
 
 
 def _key_step(
@@ -104,7 +116,9 @@ def _key_step(
     layout = make_layout(hierarchy, levels, anchors)
     # A resumed run must compare the next frame with the picture this scene shows, which may be an older one.
     meta = replace(meta, extra={**meta.extra, SHOWN: shown})
-    first = first_layer_mask(assembly, gaussians, frame, state.exposure, rng) if layered else None
+    first = first_layer_mask(assembly, gaussians, frame, exposure=state.exposure, rng=rng) if layered else None
     meta = key_meta(meta, state.exposure, anchors.origin)
-    after, packet = key_state(assembly, gaussians, layout, hierarchy, frame, meta, rng, first)
+    after, packet = key_state(
+        assembly, gaussians, layout, hierarchy=hierarchy, frame=frame, meta=meta, rng=rng, first=first
+    )
     return Step(after, packet, "key")

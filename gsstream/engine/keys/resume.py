@@ -107,7 +107,9 @@ def refinement_after(assembly: Assembly, state: StreamState, tools: Tools) -> Re
             found = start_refinement(player)
         else:
             frame = tools.recorded(player.frame)
-            found = advance_refinement(assembly, found, before, player, frame, state.exposure, tools.rng)
+            found = advance_refinement(
+                assembly, found, before, after=player, frame=frame, exposure=state.exposure, rng=tools.rng
+            )
         before = player
     return found
 

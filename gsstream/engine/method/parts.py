@@ -54,12 +54,14 @@ class PartsMethod(StreamingMethod[StreamState]):
         step = frame_step(parts, state, frame, tools)
         if runs_after_packet(parts.recipe.stream, state, frame):
             return step  # no key packet is due before the last iteration of the refinement
-        return key_packet_if_due(self.slots, refine_first_frame(self.slots, state, step, frame, tools), frame, tools)
+        return key_packet_if_due(
+            self.slots, refine_first_frame(self.slots, state, step, frame=frame, tools=tools), frame, tools
+        )
 
     def follow_up(self, state: StreamState, step: Step, frame: Frame, tools: Tools) -> Step:
         if not runs_after_packet(self.slots.recipe.stream, state, frame):
             return step
-        return refine_first_frame(self.slots, state, step, frame, tools)
+        return refine_first_frame(self.slots, state, step, frame=frame, tools=tools)
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> StreamState:
         state = replace(state_after(self.slots, tools.since_key(), tools.rng), previous=shown)

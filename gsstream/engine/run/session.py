@@ -77,7 +77,14 @@ def run(
         first_frame: frame 0 of another stream, taken over instead of being reconstructed.
         listener: called before and after every frame.
     """
-    state = _Run(limit_memory(assembly, source.info), source, out, quiet, measure, first_frame)
+    state = _Run(
+        assembly=limit_memory(assembly, source.info),
+        source=source,
+        out=out,
+        quiet=quiet,
+        measure=measure,
+        first_frame=first_frame,
+    )
     listener, done = listener or RunListener(), state.prepare(resume)
     indices = itertools.count(done) if state.total is None else range(done, state.total)
     with (

@@ -108,7 +108,9 @@ class EngineContext:
 
     def shown(self, gaussians: Gaussians[torch.Tensor], view: int) -> torch.Tensor:
         renderer, exposure = self._assembly.renderer, self.photometric.exposure
-        return render_exposed(renderer, gaussians, self.cameras, view, self._background, exposure)
+        return render_exposed(
+            renderer, gaussians, self.cameras, view=view, background=self._background, exposure=exposure
+        )
 
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
         if self._is_static(view):
@@ -155,7 +157,14 @@ class EngineContext:
         return torch.from_numpy(in_shell(means, scales, self.cameras)).to(self._device)
 
     def changed_rows(self, min_votes: float) -> torch.Tensor:
-        rows = changed_rows(self._change, self._gaussians.means, self.cameras, self.session, min_votes, self._votes)
+        rows = changed_rows(
+            self._change,
+            self._gaussians.means,
+            self.cameras,
+            session=self.session,
+            min_votes=min_votes,
+            book=self._votes,
+        )
         return rows & ~self.shell_rows
 
     def narrow(self, rows: torch.Tensor) -> None:

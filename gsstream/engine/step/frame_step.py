@@ -56,34 +56,36 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
         return empty_step(state, frame, log)
     late = assembly.checks is not Checks.STEP
     with log.phase("motion"), deferred_checks(late):
-        motions, scene, work = propose_motion(assembly, state, frame, change, tools, images)
+        motions, scene, work = propose_motion(assembly, state, frame, change=change, tools=tools, images=images)
     with log.phase("confidence"), deferred_checks(late):
         rows, logits = select(assembly, work, work.hierarchy, scope)
     with log.phase("optimise"):
         generator, views = rng.stream("frame", frame.index), len(frame.cameras)
         target = (work.everywhere() if scope is Scope.ALL else work).residual_target
         problem = Problem(
-            scene.layout,
-            work.hierarchy,
-            rows,
-            work.gaussians.rows(rows),
-            logits,
-            state.decoders,
-            work.session_for(rows),
-            target,
-            views,
-            frame.cameras.width * frame.cameras.height,
-            generator,
-            1.0 if tools.budget is None else tools.budget.step_scale,
+            layout=scene.layout,
+            hierarchy=work.hierarchy,
+            rows=rows,
+            base=work.gaussians.rows(rows),
+            logits=logits,
+            decoders=state.decoders,
+            session=work.session_for(rows),
+            target=target,
+            views=views,
+            pixels=frame.cameras.width * frame.cameras.height,
+            generator=generator,
+            step_scale=1.0 if tools.budget is None else tools.budget.step_scale,
         )
         schedule = scheduled(stream, frame, tools.budget)
         solution = optimise(assembly, problem, schedule)
         residual = quantise_residual(assembly, problem, solution)
     with log.phase("growth"):
-        delta = with_growth(assembly, state, Delta(motions).with_residual(residual), work, rng)
+        delta = with_growth(assembly, state, Delta(motions).with_residual(residual), work=work, rng=rng)
     with log.phase("code"):
         most = None if tools.budget is None else tools.budget.max_bytes
-        fitted = encode_frame(delta, state.player, frame.index, solution, assembly.recipe.codec.trim, most)
+        fitted = encode_frame(
+            delta, state.player, frame.index, solution=solution, trim=assembly.recipe.codec.trim, budget=most
+        )
         player = decode_packet(state.player, fitted.packet.data)
     with log.phase("keep"):
         # A frame that changed nothing is not what the scene shows: the next one is compared with the last that did, so

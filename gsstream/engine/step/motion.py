@@ -47,7 +47,13 @@ def propose_motion(
     """
     scene, budget = state.player.scene, tools.budget
     work = EngineContext(
-        assembly, state, frame, tools.log, change, 1.0 if budget is None else budget.part_scale, images
+        assembly=assembly,
+        state=state,
+        frame=frame,
+        log=tools.log,
+        change=change,
+        part_scale=1.0 if budget is None else budget.part_scale,
+        images=images,
     )
     proposed = assembly.motion.propose(scene, work, tools.rng, state.motion_memory)
     motions = tuple(motion for motion in proposed if not motion.is_empty)

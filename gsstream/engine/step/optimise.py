@@ -78,14 +78,14 @@ class _Fit:
         units, matrix = torch.from_numpy(layout.units_of(index)).to(device), self.code.join_decoders(self.decoders)
         self.residual = assembly.optimiser.residual_optimiser(self.code, problem.base, units, matrix)
         self.gates = TrainedGates(
-            assembly.gate,
-            assembly.regularizer,
-            assembly.optimiser,
-            GATE_LR,
-            problem.logits,
-            problem.hierarchy,
-            problem.rows,
-            problem.generator,
+            gate=assembly.gate,
+            regularizer=assembly.regularizer,
+            optimiser=assembly.optimiser,
+            lr=GATE_LR,
+            logits=problem.logits,
+            hierarchy=problem.hierarchy,
+            rows=problem.rows,
+            generator=problem.generator,
         )
         self.open_gates: list[int] = []
 
@@ -100,7 +100,11 @@ class _Fit:
         begin = partial(self.assembly.where.iterate, first)
         self.gates.draw_ahead(len(iterations))
         with deferred_checks(self.assembly.checks is not Checks.STEP):
-            return self.residual.run(ResidualEpoch(self.problem.session, iterations, self.gates, price, begin))
+            return self.residual.run(
+                ResidualEpoch(
+                    session=self.problem.session, iterations=iterations, gates=self.gates, rd_lambda=price, begin=begin
+                )
+            )
 
     def frozen(self, fraction: float) -> torch.Tensor | None:
         """[A] bool: rows whose level is not trained yet at this share of the frame; None: all take part."""

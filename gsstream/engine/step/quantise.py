@@ -50,7 +50,13 @@ def quantise_residual(assembly: Assembly, problem: Problem, solution: Solution) 
     table = {name: value for name, value in table.items() if value.any()}
     decoders = {name: value.numpy() for name, value in solution.decoders.items() if name in table}
     steps = {name: codes[name].step for name in table}
-    return Residual(gates, assembly.gate.num_levels, table, steps, quantise_decoders(decoders))
+    return Residual(
+        gates=gates,
+        num_levels=assembly.gate.num_levels,
+        symbols=table,
+        steps=steps,
+        decoders=quantise_decoders(decoders),
+    )
 
 
 def check_solution(assembly: Assembly, problem: Problem, solution: Solution) -> None:
@@ -98,7 +104,7 @@ def encode_frame(
     if delta.residual is not None:
         rows, sent = solution.rows.numpy(), sent_rows(before.layout, delta.residual.gates)
         curvature = {n: gather_rows_or_zero(solution.curvature[n].numpy(), rows, sent) for n in delta.residual.symbols}
-    found = trim_to_size(delta, packet, curvature, before.layout, encoded, limit)
+    found = trim_to_size(delta, packet, curvature, layout=before.layout, encode=encoded, max_bytes=limit)
     # Where only a share is asked for, a packet is not trimmed to nothing: one that is mostly headers would lose all of
     # its change for a few bytes.
     lost = found.delta.is_empty or found.delta.has_row_edit != delta.has_row_edit

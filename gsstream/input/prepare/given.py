@@ -60,13 +60,19 @@ def _taken(recording: Recording) -> tuple[list[RawCamera], GivenRig]:
         raise SourceError(f"{recording.where}: cameras found: {len(cameras)}; expected at least two")
     lenses = tuple(_lens(K, recording.lenses.get(name)) for name, K in zip(rig.ids, rig.Ks, strict=True))
     fps = beside.fps or recording.fps
-    return cameras, GivenRig(rig.viewmats, lenses, recording.test, fps, recording.licence)
+    return cameras, GivenRig(
+        viewmats=rig.viewmats, lenses=lenses, test=recording.test, fps=fps, licence=recording.licence
+    )
 
 
 def _camera(name: str, clip: Clip, span: range) -> RawCamera:
     """Pictures stay files, which a scene may hold as they are."""
     files = clip.files[span.start : span.stop] if isinstance(clip, ImageClip) else ()
-    return RawCamera(name, files, clip.size) if files else RawCamera(name, (), clip.size, clip, span)
+    return (
+        RawCamera(name, files, clip.size)
+        if files
+        else RawCamera(name=name, files=(), size=clip.size, clip=clip, span=span)
+    )
 
 
 def _lens(K: FloatArray, distortion: Distortion | None) -> Lens:

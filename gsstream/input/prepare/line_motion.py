@@ -55,7 +55,13 @@ def _motion(images: FloatArray) -> Motion:
     moves &= (moves.mean(axis=(1, 2)) < MOST)[:, None, None]
     step, row, column = np.nonzero(moves)
     strength = np.minimum(change[step, row, column], LARGE)
-    return Motion(len(change), step, np.stack([column, row], axis=1) + 0.5, strength, change[0].size)
+    return Motion(
+        steps=len(change),
+        step=step,
+        place=np.stack([column, row], axis=1) + 0.5,
+        strength=strength,
+        pixels=change[0].size,
+    )
 
 
 def barcodes(

@@ -84,7 +84,7 @@ def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say, tell:
     say("reading frame 0")
     images = first_frames(cameras)
     say(f"matching features of {len(cameras)} pictures; minutes for tens of cameras")
-    mapping = _map(cameras, images, known, test, options, tell)
+    mapping = _map(cameras, images, known, test=test, options=options, tell=tell)
     kept = [i for i, there in enumerate(mapping.registered) if there]
     if sum(names[i] not in test for i in kept) < 2:
         raise InputError(
@@ -98,15 +98,27 @@ def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say, tell:
     found = _points(mapping, rig, options)
     points, bounds = found if found else (None, None)
     say(f"kept {len(found[0]) if found else 'no'} points; writing pictures")
-    counts = _write_pictures([cameras[i] for i in kept], [lens for _, lens in lenses], out, options, tell)
+    counts = _write_pictures([cameras[i] for i in kept], [lens for _, lens in lenses], out, options=options, tell=tell)
     frames = min(counts)
     if frames < max(counts):
         told = ", ".join(f"{name} {count}" for name, count in zip(rig.ids, counts, strict=True))
         say(f"warning: cameras differ in their frames ({told}); the first {frames} are used")
     fps = known.fps if known else options.fps
-    _write(out, title, rig, test, found, frames, fps, "" if known is None else known.licence)
+    _write(
+        out, title, rig, test=test, found=found, frames=frames, fps=fps, licence="" if known is None else known.licence
+    )
     left_out = tuple(name for i, name in enumerate(names) if i not in kept)
-    return Prepared(names, left_out, test, mapping, rig, points, bounds, frames, known is not None)
+    return Prepared(
+        names=names,
+        left_out=left_out,
+        test=test,
+        mapping=mapping,
+        rig=rig,
+        points=points,
+        bounds=bounds,
+        frames=frames,
+        known_poses=known is not None,
+    )
 
 
 def _map(
@@ -128,7 +140,7 @@ def _map(
     size = _smallest([cameras[i] for i in training])
     tell("undistorting frame 0", 0, 0)
     made: dict[tuple[Lens, tuple[int, int]], Undistortion] = {}
-    flat = [_flat(images[i], cameras[i].size, known.lenses[i], size, made) for i in training]
+    flat = [_flat(images[i], cameras[i].size, known.lenses[i], target=size, made=made) for i in training]
     rig = Cameras(
         tuple(cameras[i].name for i in training), known.viewmats[training], np.stack([K for K, _ in flat]), *size
     )

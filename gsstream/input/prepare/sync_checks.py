@@ -201,7 +201,7 @@ def _swapped(cameras: Cameras, seen: list[Motion], now: FloatArray) -> list[Find
     suspects = [int(c) for c in np.argsort(own)[:SUSPECTS] if own[c] < STAND_OUT * np.median(own)]
     found = []
     for a, b in combinations(sorted(suspects), 2):
-        changed = min(_fit(cameras, seen, x, y, (a, b)) - own[x] for x, y in ((a, b), (b, a)))
+        changed = min(_fit(cameras, seen, x, pose=y, without=(a, b)) - own[x] for x, y in ((a, b), (b, a)))
         if changed > EXCHANGED and min(own[a], own[b]) + changed > ALIKE:
             found.append(
                 error(

@@ -130,8 +130,8 @@ def _rig(path: Path, cameras: list[dict[str, Any]], sizes: dict[str, tuple[int, 
                 f"{path}: all cameras of a rig must share one image size, but {ids[0]!r} is {first[0]} x {first[1]} "
                 f"and {camera_id!r} is {size[0]} x {size[1]}; to bring them to one: {prepare_command(str(path.parent))}"
             )
-    poses = np.stack([_matrix(path, i, c, "w2c", 4) for i, c in zip(ids, cameras, strict=True)])
-    intrinsics = np.stack([_matrix(path, i, c, "K", 3) for i, c in zip(ids, cameras, strict=True)])
+    poses = np.stack([_matrix(path, i, c, key="w2c", side=4) for i, c in zip(ids, cameras, strict=True)])
+    intrinsics = np.stack([_matrix(path, i, c, key="K", side=3) for i, c in zip(ids, cameras, strict=True)])
     rig = Cameras(tuple(ids), poses, intrinsics, *first)
     try:
         rig.validate()

@@ -34,7 +34,7 @@ def read_ply_points(path: Path) -> PointCloud:
     body = data.find(b"\n", end) + 1
     lines = [line.split() for line in data[:end].decode("ascii", "replace").splitlines()]
     encoding, count, fields = _header(path, lines)
-    table = _table(path, data[body:], encoding, count, fields)
+    table = _table(path, data[body:], encoding, count=count, fields=fields)
     names = table.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
         raise SourceError(f"{path}: no x, y, z among the vertex properties {', '.join(names)}")

@@ -160,7 +160,9 @@ class SyntheticSource:
         light = light.copy()
         light[front] = np.maximum(moving.normal[front] @ LIGHT, 0)
         if self._options.shadows:
-            self._cast_shadows(origin, rays, np.minimum(moving.distance, behind.distance), front, light, shapes)
+            self._cast_shadows(
+                origin, rays, np.minimum(moving.distance, behind.distance), front=front, light=light, shapes=shapes
+            )
         colors = albedo * (_AMBIENT + (1 - _AMBIENT) * light)[:, None] * np.float32(self._scene.light(index))
         n = self._options.supersample
         fine = colors.reshape(cameras.height, n, cameras.width, n, 3)

@@ -54,7 +54,9 @@ def arc_cameras(views: int, width: int, height: int) -> Cameras:
     focal = 0.95 * width
     intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     ids = ("test", *(f"cam{i:02d}" for i in range(views)))
-    return Cameras(ids, viewmats, np.repeat(intrinsics[None], len(ids), axis=0), width, height)
+    return Cameras(
+        ids=ids, viewmats=viewmats, Ks=np.repeat(intrinsics[None], len(ids), axis=0), width=width, height=height
+    )
 
 
 def _look_at(center: FloatArray, target: FloatArray) -> FloatArray:

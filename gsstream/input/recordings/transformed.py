@@ -113,7 +113,14 @@ class TransformedSource:
             cameras, images = cameras.select([]), images[:0]
         if bad and split == "train" and self._options.bad_image == "drop":
             epoch_scale = 0.0
-        return Frame(index, index / self._info.fps, images, cameras, epoch_scale, self._arrival(cache.values()))
+        return Frame(
+            index=index,
+            timestamp=index / self._info.fps,
+            images=images,
+            cameras=cameras,
+            epoch_scale=epoch_scale,
+            arrival=self._arrival(cache.values()),
+        )
 
     def _arrival(self, read: Collection[Frame]) -> Arrival | None:
         """How a frame came in that is made of these of the inner source: with the last of them."""
@@ -160,7 +167,7 @@ class TransformedSource:
 
     def _delivered_frame(self, name: str, index: int) -> int | None:
         """The frame whose image this camera delivers at ``index``; None: a black one."""
-        while is_lost(self._disturbances, self._losses, name, index, self._rng):
+        while is_lost(self._disturbances, self._losses, name, index=index, rng=self._rng):
             if self._disturbances.lost_as == "black":
                 return None
             index -= 1
@@ -187,7 +194,7 @@ class TransformedSource:
         image = self._read(name, self._start + index + self._offsets.get(name, 0), cache)
         image = with_gain(image, gain_at(options, index, self._rng))
         if split == "train" and options.noise_sigma > 0 and index < options.noise_frames:
-            image = with_noise(image, options.noise_sigma, name, index, self._rng)
+            image = with_noise(image, options.noise_sigma, name, index=index, rng=self._rng)
         return image
 
     def _read(self, name: str, index: int, cache: dict[tuple[int, Split], Frame]) -> FloatArray:

@@ -102,7 +102,14 @@ class WatchSource:
         for i, camera_id in enumerate(cameras.ids):
             images[i] = self._image(camera_id, held.get(camera_id, index))
         arrival = self._arrival(index, () if plan.skipped else held)
-        return Frame(index, index / self._info.fps, images, cameras, plan.epoch_scale, arrival)
+        return Frame(
+            index=index,
+            timestamp=index / self._info.fps,
+            images=images,
+            cameras=cameras,
+            epoch_scale=plan.epoch_scale,
+            arrival=arrival,
+        )
 
     def epoch_scale(self, index: int) -> float:
         """Return what a frame is worth now that its turn has come: more may wait than when it was read ahead."""
@@ -189,7 +196,7 @@ class WatchSource:
             ended = (self._folder / self._options.end).exists()
             before = dict(seen)
             open_names = [name for name in self._ids if name not in whole]
-            settled = [name for name in open_names if self._settled(name, index, seen, changed, ended)]
+            settled = [name for name in open_names if self._settled(name, index, seen, changed=changed, ended=ended)]
             whole |= {name for name in settled if self._decodes(name, index)}
             absent = [name for name in self._ids if name not in whole]
             if not absent:

@@ -157,7 +157,9 @@ def reconstruct(folder: Path) -> None:
     held_error = np.full(len(images), np.nan)
     for index in sorted(held):
         camera = next(iter(best.cameras.values())) if shared else known[index]
-        poses[index], held_error[index] = _register(database, images, best, index, camera, refine=not shared)
+        poses[index], held_error[index] = _register(
+            database, images, best, index=index, camera=camera, refine=not shared
+        )
         cameras[index] = camera
     viewmats = np.full((len(images), 4, 4), np.nan)
     for index, pose in poses.items():

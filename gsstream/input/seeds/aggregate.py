@@ -12,8 +12,10 @@ def aggregate(cost: FloatArray, guide: FloatArray, step: float, jump: float, edg
 
     Returns [D, H, W] float32.
     """
-    down = _both_ways(np.ascontiguousarray(cost.transpose(1, 0, 2)), guide, step, jump, edge)
-    across = _both_ways(np.ascontiguousarray(cost.transpose(2, 0, 1)), np.ascontiguousarray(guide.T), step, jump, edge)
+    down = _both_ways(np.ascontiguousarray(cost.transpose(1, 0, 2)), guide, step, jump=jump, edge=edge)
+    across = _both_ways(
+        np.ascontiguousarray(cost.transpose(2, 0, 1)), np.ascontiguousarray(guide.T), step, jump=jump, edge=edge
+    )
     total: FloatArray = down.transpose(1, 0, 2) + across.transpose(1, 2, 0)
     return total
 

@@ -104,7 +104,7 @@ def color_gains(images: FloatArray, depths: FloatArray, accepted: BoolArray, cam
         for other in range(count):
             if other == view:
                 continue
-            ratio = _log_ratio(points, colors, images[other], depths[other], cameras, other)
+            ratio = _log_ratio(points, colors, images[other], depth_map=depths[other], cameras=cameras, other=other)
             if ratio is not None:
                 row = np.zeros(count)
                 row[view], row[other] = 1, -1

@@ -133,7 +133,16 @@ def _mapping(found: dict[str, Any], viewmats: FloatArray, lenses: tuple[Lens, ..
     error = np.divide(total, seen, out=np.full(count, np.nan), where=seen > 0)
     if "held_error" in found:
         error = np.where(seen > 0, error, found["held_error"])
-    return Mapping(viewmats, lenses, found["xyz"], found["rgb"], found["error"], found["track"], error, seen)
+    return Mapping(
+        viewmats=viewmats,
+        lenses=lenses,
+        xyz=found["xyz"],
+        rgb=found["rgb"],
+        error=found["error"],
+        track=found["track"],
+        camera_error=error,
+        camera_points=seen,
+    )
 
 
 def lens_places(lens: Lens, size: tuple[int, int], rays: FloatArray) -> FloatArray:

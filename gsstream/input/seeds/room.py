@@ -116,12 +116,12 @@ def with_room(
     partners = neighbour_views(cameras, MOST_CAMERAS)
     depths, kept = depths.copy(), accepted & (given | (depths < IN_FRONT * room))
     for view in range(len(cameras)):
-        match = _match(images, cameras, view, swept[view], partners[view].tolist())
+        match = _match(images, cameras, view, depth=swept[view], others=partners[view].tolist())
         more = ~given[view] & ~kept[view] & (swept[view] < CLEARLY_IN_FRONT * room[view]) & (support[view] >= 1)
         more &= match.best > CONFIRMED
         depths[view][more] = swept[view][more]
         kept[view] |= more
-        wall = _match(images, cameras, view, room[view], partners[view].tolist())
+        wall = _match(images, cameras, view, depth=room[view], others=partners[view].tolist())
         contradicted = wall.seen & (wall.best < CONTRADICTED) & (wall.texture > NOISE)
         taken = ~given[view] & ~kept[view] & ~contradicted
         depths[view][taken] = room[view][taken]
@@ -232,7 +232,9 @@ def surface_agreement(grey: torch.Tensor, cameras: Cameras, surface: FloatArray,
     few of them. The same for any number of workers.
     """
     points, shape = surface.reshape(-1, 3), surface.shape[:2]
-    drawn = list(pool.map(lambda view: _drawn_on(grey[view], cameras, view, points, shape), range(len(grey))))
+    drawn = list(
+        pool.map(lambda view: _drawn_on(grey[view], cameras, view, points=points, shape=shape), range(len(grey)))
+    )
     shades, there = torch.stack([shade for shade, _ in drawn]), torch.stack([seen for _, seen in drawn])
     means, squares = window_mean(torch.stack([shades, shades * shades], 1), HALF).unbind(1)
     variance = (squares - means * means).clamp_min(0)
@@ -263,7 +265,9 @@ def _match(images: FloatArray, cameras: Cameras, view: int, depth: FloatArray, o
     variance = (square - mean * mean).clamp_min(0)
     best, seen = torch.full(depth.shape, -1.0), torch.zeros(depth.shape, dtype=torch.bool)
     for other in others:
-        shade, there = _drawn_on(torch.from_numpy(images[other].mean(-1)), cameras, other, points, depth.shape)
+        shade, there = _drawn_on(
+            torch.from_numpy(images[other].mean(-1)), cameras, other, points=points, shape=depth.shape
+        )
         moments = window_mean(torch.stack([shade, shade * shade, shade * own])[:, None], HALF)[:, 0]
         spread = (moments[1] - moments[0] ** 2).clamp_min(0)
         same = (moments[2] - moments[0] * mean) / ((variance + NOISE**2) * (spread + NOISE**2)).sqrt()

@@ -65,7 +65,9 @@ def sweep_depths(images: FloatArray, cameras: Cameras, settings: SweepSettings, 
     stop = threading.Event()
 
     def one(view: int) -> FloatArray:
-        cost = _matching_cost(grey, cameras, view, partners[view].tolist(), inverse[view], settings, stop)
+        cost = _matching_cost(
+            grey, cameras, view, partners=partners[view].tolist(), inverse=inverse[view], settings=settings, stop=stop
+        )
         total = aggregate(cost, grey[view].numpy(), settings.step_penalty, settings.jump_penalty)
         plane = best_plane(total)
         depth: FloatArray = (root[view, 0] + plane * (root[view, 1] - root[view, 0])) ** -2.0
@@ -102,7 +104,9 @@ def agreements(
     for row, view in enumerate(views):
         root = np.linspace(near_far[view, 1] ** -0.5, near_far[view, 0] ** -0.5, settings.planes)
         inverse = (root**2).astype(np.float32)
-        cost = _matching_cost(grey, cameras, view, partners[view].tolist(), inverse, settings).min(0)
+        cost = _matching_cost(
+            grey, cameras, view, partners=partners[view].tolist(), inverse=inverse, settings=settings
+        ).min(0)
         variance = _mean_and_variance(grey[view][None, None], settings.windows[0])[1][0, 0].numpy()
         textured = variance > (3 * settings.noise) ** 2
         if textured.any():
@@ -133,7 +137,7 @@ def _matching_cost(
         best = torch.full((len(planes), height, width), settings.unseen)
         second = best.clone()
         for partner, (rotation, translation) in zip(partners, maps, strict=True):
-            grid, unseen = _grid(rotation, translation, planes, height, width)
+            grid, unseen = _grid(rotation, translation, planes, height=height, width=width)
             warped = F.grid_sample(
                 grey[partner][None, None], grid, mode="bilinear", padding_mode="border", align_corners=False
             ).reshape(len(planes), 1, height, width)

@@ -72,17 +72,17 @@ def _decode(data: bytes, scene: Scene) -> Field:
     if flags & ~_MARKED:
         raise PacketError(f"field: unknown flags {flags}; upgrade gsstream")
     shape = FieldShape(
-        (box[0], box[1], box[2]),
-        (box[3], box[4], box[5]),
-        reach,
-        levels,
-        entries,
-        features,
-        base,
-        growth,
-        width,
-        layers,
-        seed,
+        low=(box[0], box[1], box[2]),
+        high=(box[3], box[4], box[5]),
+        reach=reach,
+        levels=levels,
+        entries=entries,
+        features=features,
+        base=base,
+        growth=growth,
+        width=width,
+        layers=layers,
+        seed=seed,
     )
     problem = shape.problem() or _steps(entry_step, weight_step)
     if problem:
@@ -100,7 +100,14 @@ def _decode(data: bytes, scene: Scene) -> Field:
     sizes = [(len(which), features) for which in touched]
     sizes += list(itertools.pairwise(shape.widths))
     tables = tuple(decode_symbols(blob, *size) for blob, size in zip(blobs[1:], sizes, strict=True))
-    change = Field(shape, marks, tables[:levels], tables[levels:], entry_step, weight_step)
+    change = Field(
+        shape=shape,
+        marks=marks,
+        entries=tables[:levels],
+        weights=tables[levels:],
+        entry_step=entry_step,
+        weight_step=weight_step,
+    )
     problem = mismatch(change, touched)
     if problem:
         raise PacketError(f"field: {problem}")

@@ -71,7 +71,14 @@ def _decode(data: bytes, scene: Scene) -> Motion:
     flags, bins, cell, translation_step, rotation_step = _MOTION.unpack_from(data)
     if flags & ~(_PREDICTED | _REGROUP):
         raise PacketError(f"motion: unknown flags {flags}; upgrade gsstream")
-    none = Motion(cell, bins, np.zeros(0, np.uint8), np.zeros((0, 6), np.int32), translation_step, rotation_step)
+    none = Motion(
+        cell=cell,
+        brightness_bins=bins,
+        moving=np.zeros(0, np.uint8),
+        symbols=np.zeros((0, 6), np.int32),
+        translation_step=translation_step,
+        rotation_step=rotation_step,
+    )
     problem = _misfit(none)
     if problem:
         raise PacketError(f"motion: {problem}")
@@ -82,7 +89,16 @@ def _decode(data: bytes, scene: Scene) -> Motion:
     if levels != 1:
         raise PacketError("motion: groups move or stand still, there are no levels")
     symbols = decode_symbols(table, int(np.count_nonzero(moving)), 6)
-    motion = Motion(cell, bins, moving, symbols, translation_step, rotation_step, bool(flags & _PREDICTED), regroup)
+    motion = Motion(
+        cell=cell,
+        brightness_bins=bins,
+        moving=moving,
+        symbols=symbols,
+        translation_step=translation_step,
+        rotation_step=rotation_step,
+        predicted=bool(flags & _PREDICTED),
+        regroup=regroup,
+    )
     problem = _exceeds_range(motion)
     if problem:
         raise PacketError(f"motion: {problem}")

@@ -98,7 +98,7 @@ def decode_residual(
             decoders[name] = known[name]
     if not set(sent) <= set(decoders):
         raise PacketError("delta packet: a decoder is sent that no attribute uses", sections["decoders"].offset)
-    return Residual(gates, num_levels, symbols, steps, decoders)
+    return Residual(gates=gates, num_levels=num_levels, symbols=symbols, steps=steps, decoders=decoders)
 
 
 def _check_residual(residual: Residual, layout: Layout) -> None:

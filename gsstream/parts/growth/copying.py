@@ -57,7 +57,9 @@ def replace_with_copies(
         return RowEdit(removed=removed)
     kept = scene.gaussians.rows(np.delete(np.arange(len(scene.gaussians)), removed)).map(torch.from_numpy)
     kept = kept.map(lambda value: value.to(work.gaussians.means.device))
-    added = fit_copies(kept, work.everywhere(), settings, rng, admitted).map(lambda value: value.cpu().numpy())
+    added = fit_copies(kept, work.everywhere(), settings, rng=rng, admitted=admitted).map(
+        lambda value: value.cpu().numpy()
+    )
     if not len(added):
         return RowEdit(removed=removed)
     return RowEdit(add_as_nodes(added, np.zeros(len(added), np.uint8), len(scene.layout.node_counts)), removed)
@@ -86,7 +88,7 @@ def fit_copies(
         added = concat_gaussians(added, copies) if len(added) else copies
         if not len(added):
             continue
-        added = fit_added(scene, added, work, views, passes, rng)
+        added = fit_added(scene, added, work, views=views, epochs=passes, rng=rng)
         added = added.rows(added.opacities.sigmoid() >= settings.prune_opacity)
     return added
 
@@ -139,7 +141,7 @@ class Copies(Growth):
         kept, number = work.key_rows, len(after.gaussians)
         last = self.config.leave == "last-added"
         rows = np.arange(kept, number) if last else least_opaque(after, number - kept)
-        return replace_with_copies(after, rows, work, self.config, rng)
+        return replace_with_copies(after, rows, work, settings=self.config, rng=rng)
 
 
 def least_opaque(scene: Scene, number: int) -> IntArray:

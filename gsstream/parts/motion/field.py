@@ -43,7 +43,7 @@ def approximate_by_cells(
     values: FloatArray = np.concatenate([translation, rotation], 1).astype(np.float64)
     means = np.stack([np.bincount(place, values[:, i], groups.count) / np.maximum(hits, 1) for i in range(6)], 1)
     # Half a cell from its centre, a turn of one step moves a Gaussian by a step, too.
-    return rounded_motion(groups, able, means[able], step, step / side)
+    return rounded_motion(groups, able, means[able], translation_step=step, rotation_step=step / side)
 
 
 def rounded_motion(

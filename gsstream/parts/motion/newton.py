@@ -64,7 +64,9 @@ class DampedNewton:
         so what earlier views said of them was said of another place.
         """
         matrix = self._damped_curvature()
-        bodies = form_bodies(center, unit, self.values.cpu().numpy(), matrix.cpu().numpy(), settings.most)
+        bodies = form_bodies(
+            center, unit, self.values.cpu().numpy(), curvature=matrix.cpu().numpy(), most=settings.most
+        )
         there = torch.from_numpy(bodies.values).to(matrix.device)
         away = matrix @ (self.values - there)[..., None]
         away = torch.linalg.solve_ex(matrix + settings.hold * self._identity, away).result[..., 0]

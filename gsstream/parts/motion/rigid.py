@@ -94,7 +94,16 @@ class Rigid(MotionPart):
         kept = total >= config.least
         moving = np.zeros(groups.count, np.uint8)
         moving[np.flatnonzero(able)[kept]] = 1
-        return (Motion(groups.cell, groups.brightness_bins, moving, symbols[kept], float(steps[0]), float(steps[1])),)
+        return (
+            Motion(
+                cell=groups.cell,
+                brightness_bins=groups.brightness_bins,
+                moving=moving,
+                symbols=symbols[kept],
+                translation_step=float(steps[0]),
+                rotation_step=float(steps[1]),
+            ),
+        )
 
     def _fitted(self, work: FitContext, start: GroupTransforms[FloatArray], units: Units, rng: Rng) -> FloatArray:
         """[K, 6] shift and turn of the groups that explain the images best."""
@@ -105,4 +114,6 @@ class Rigid(MotionPart):
         values = 3 * work.cameras.height * work.cameras.width * len(work.cameras)
         bodies = BodySettings(config.body_cost * values**0.5, config.body_hold)
         order = rng.numpy("motion", work.index)
-        return fit_transforms_newton(work, start, units.row, total, order, damping, bodies)
+        return fit_transforms_newton(
+            work, start, units.row, iterations=total, order=order, damping=damping, settings=bodies
+        )

@@ -57,4 +57,4 @@ class RowOptimiser(Part):
             units: [A] unit of the position of each row, scene units.
             matrix: [L, D] decoders to start from.
         """
-        return JointResidualOptimiser(code, base, units, matrix, self)
+        return JointResidualOptimiser(code=code, base=base, units=units, matrix=matrix, optimiser=self)

@@ -140,11 +140,11 @@ class JointResidualOptimiser(ResidualOptimiser):
     def forward(self, gates: torch.Tensor) -> Gaussians[torch.Tensor]:
         self._gates = gates
         self._change = decode_joint(self._code, self.latents.detach(), self.matrix, self._units)
-        return add_joint(self._code, self._base, self._features, self._change, gates)
+        return add_joint(self._code, self._base, self._features, change=self._change, gates=gates)
 
     def backward(self, grad: Gaussians[torch.Tensor], rd_lambda: float) -> torch.Tensor:
         upstream = join_features(self._code, grad)
-        back = joint_vjp(self._code, upstream, self._change, self.matrix, self._gates, self._units)
+        back = joint_vjp(self._code, upstream, self._change, matrix=self.matrix, gates=self._gates, units=self._units)
         if rd_lambda:
             back.latents.add_(rate_gradient(self.latents.detach(), self._code.steps, self._gates, rd_lambda))
         self._grad = back

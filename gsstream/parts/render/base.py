@@ -78,7 +78,7 @@ class Renderer(Part):
             gaussians: N rows, raw values. active: [A] rows that change, ascending; None: all.
             cameras: the rig. background: colour behind everything, 0 to 1.
         """
-        return ScatterSession(self, gaussians, active, cameras, background)
+        return ScatterSession(renderer=self, gaussians=gaussians, active=active, cameras=cameras, background=background)
 
 
 class ScatterSession(RenderSession):

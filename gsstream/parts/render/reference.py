@@ -38,7 +38,7 @@ class ReferenceRenderer(Renderer):
     def render(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, background: tuple[float, float, float]
     ) -> RenderOutput:
-        return self._render(gaussians, cameras, view, background, None)
+        return self._render(gaussians, cameras, view, background=background, probe=None)
 
     def screen_gradient(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, image_gradient: torch.Tensor
@@ -46,7 +46,7 @@ class ReferenceRenderer(Renderer):
         fixed = gaussians.map(torch.Tensor.detach)
         probe = torch.zeros(len(fixed), 2, dtype=fixed.means.dtype, requires_grad=True)
         with torch.enable_grad():
-            output = self._render(fixed, cameras, view, (0.0, 0.0, 0.0), probe)
+            output = self._render(fixed, cameras, view, background=(0.0, 0.0, 0.0), probe=probe)
             (gradient,) = torch.autograd.grad((output.image * image_gradient).sum(), probe, allow_unused=True)
         gradient = torch.zeros_like(probe) if gradient is None else gradient.detach()
         # Visibility must not be read from the gradient: a Gaussian in view may have gradient 0.
@@ -59,13 +59,15 @@ class ReferenceRenderer(Renderer):
         cameras: Cameras,
         background: tuple[float, float, float],
     ) -> ScatterSession:
-        return _ReferenceSession(self, gaussians, active, cameras, background)
+        return _ReferenceSession(
+            renderer=self, gaussians=gaussians, active=active, cameras=cameras, background=background
+        )
 
     def nudged(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, offsets: torch.Tensor
     ) -> RenderOutput:
         """Render on black with every 2-D mean moved: what screen gradients are derivatives of."""
-        return self._render(gaussians, cameras, view, (0.0, 0.0, 0.0), offsets)
+        return self._render(gaussians, cameras, view, background=(0.0, 0.0, 0.0), probe=offsets)
 
     def _render(
         self,
@@ -109,7 +111,7 @@ class _ReferenceSession(ScatterSession):
         whole = self._whole(rows)
         if probe is not None and self._active is not None:
             probe = torch.zeros(len(whole), 2, dtype=probe.dtype).index_copy(0, self._active, probe)
-        return self._renderer._render(whole, self._cameras, view, self._background, probe)
+        return self._renderer._render(whole, self._cameras, view, background=self._background, probe=probe)
 
 
 def project(

@@ -190,8 +190,10 @@ class RenderSession(ABC):
         by_probe = None if probe is None else gradient_of(probe)
         curvature = None
         if isinstance(wrt, WrtTransforms) and wrt.curvature:
-            curvature = _curvature(self, view, target, wrt.transforms, leaves, wanted)
-        return LossAndGrad(loss, wrt.grad(leaves), curvature, by_probe, by_exposure)
+            curvature = _curvature(self, view, target, transforms=wrt.transforms, leaves=leaves, wanted=wanted)
+        return LossAndGrad(
+            loss=loss, grad=wrt.grad(leaves), curvature=curvature, means2d=by_probe, exposure=by_exposure
+        )
 
     def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
         """Return the session of the next scene, equal bit for bit to one opened anew with ``gaussians``.
@@ -251,4 +253,4 @@ def _curvature(
     # The gradient of a pixel by a colour is the share that its Gaussian has of the pixel's light.
     truth = target.image if target.image.is_floating_point() else target.image.float() / recorded.new_tensor(255)
     backward([image], [weighted_structure_tensor(recorded, truth)])
-    return curvature_of(rows.means, transforms, session.cameras, view, gradient_of(colour)[:, 0] / SH0)
+    return curvature_of(rows.means, transforms, session.cameras, view=view, structure=gradient_of(colour)[:, 0] / SH0)

@@ -44,7 +44,14 @@ def joint_layout(
     for name in decoders:
         trained[latent[name], feature[name]] = 1
     rates = trained.new_tensor(decoder_lrs)[:, None]
-    return JointLayout(latent, feature, trained.new_tensor(steps), trained.new_tensor(lrs), rates, trained)
+    return JointLayout(
+        latent=latent,
+        feature=feature,
+        steps=trained.new_tensor(steps),
+        lrs=trained.new_tensor(lrs),
+        decoder_lrs=rates,
+        trained=trained,
+    )
 
 
 def _width(value: torch.Tensor) -> int:

@@ -246,4 +246,4 @@ def check_permutation(part: Part) -> None:
             del first[name], second[name]
         elif behaviour.by_gaussian:
             first[name] = first[name][order]
-    all_equal("permuted Gaussians", second, first, 1e-4, f"{ROUNDING}; splats at equal depth may swap")
+    all_equal("permuted Gaussians", second, first, tolerance=1e-4, why=f"{ROUNDING}; splats at equal depth may swap")

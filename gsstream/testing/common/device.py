@@ -75,7 +75,13 @@ def check_device(part: Part) -> None:
             _look(log, per_iteration)
             for output, value in found.items():
                 assert value.device == DEVICE, f"{output}: expected the device of the inputs, got {value.device}"
-            all_equal(f"world {name!r} on another device", {k: v.cpu() for k, v in found.items()}, want, 1e-5, WHY)
+            all_equal(
+                f"world {name!r} on another device",
+                {k: v.cpu() for k, v in found.items()},
+                want,
+                tolerance=1e-5,
+                why=WHY,
+            )
 
 
 def _with_gradients(part: Part, world: World, differentiate: bool) -> Outputs:

@@ -33,7 +33,13 @@ def check_confidence_static_frame(part: ConfidenceEstimator) -> None:
     """Identical consecutive frames: finite, and at most the declared floor."""
     got = part.estimate(get_case("static"))
     finite("a frame in which nothing changed", got)
-    at_most("a frame in which nothing changed", got, part.claims().floor, 1e-5, "float32 of the declared floor")
+    at_most(
+        "a frame in which nothing changed",
+        got,
+        part.claims().floor,
+        tolerance=1e-5,
+        why="float32 of the declared floor",
+    )
 
 
 @check("confidence")
@@ -43,7 +49,7 @@ def check_confidence_unseen(part: ConfidenceEstimator) -> None:
     hidden = case.gaussians.means[:, 1] > 5
     got = part.estimate(case)[hidden]
     finite("Gaussians nobody sees", got)
-    at_most("Gaussians nobody sees", got, part.claims().floor, 1e-5, "float32 of the declared floor")
+    at_most("Gaussians nobody sees", got, part.claims().floor, tolerance=1e-5, why="float32 of the declared floor")
 
 
 @check("confidence")
@@ -54,8 +60,8 @@ def check_confidence_view_order(part: ConfidenceEstimator) -> None:
         "shuffled cameras",
         part.estimate(case.views([2, 0, 1])),
         part.estimate(case),
-        1e-4,
-        "sums over views in another order, amplified by a division by their spread",
+        tolerance=1e-4,
+        why="sums over views in another order, amplified by a division by their spread",
     )
 
 
@@ -97,7 +103,7 @@ def check_confidence_no_cameras(part: ConfidenceEstimator) -> None:
     """Without a camera no Gaussian is visible: logits are at most the declared floor."""
     got = part.estimate(get_case("cloud").views([]))
     finite("no cameras", got)
-    at_most("no cameras", got, part.claims().floor, 1e-5, "float32 of the declared floor")
+    at_most("no cameras", got, part.claims().floor, tolerance=1e-5, why="float32 of the declared floor")
 
 
 @check("confidence")
@@ -122,7 +128,13 @@ def check_confidence_brightness(part: ConfidenceEstimator) -> None:
     finite("brighter by a fiftieth", got)
     bound = part.claims().brightness
     assert bound is not None
-    at_most("mean logit of a scene that is brighter by a fiftieth", got, bound, 1e-4, "float32 of the declared bound")
+    at_most(
+        "mean logit of a scene that is brighter by a fiftieth",
+        got,
+        bound,
+        tolerance=1e-4,
+        why="float32 of the declared bound",
+    )
 
 
 #: A pixel that every camera of the cloud covers.

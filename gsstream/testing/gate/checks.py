@@ -34,8 +34,8 @@ def check_gate_range_and_levels(part: GateSampler) -> None:
     assert 1 <= levels <= 255, f"num_levels: expected 1 to 255, got {levels}"
     for how, gates in _samples(part, part.init(_spread())):
         k = torch.round(gates * levels)
-        at_most(f"{how}: levels", k, float(levels), 0.0, "a gate is at most fully open")
-        at_most(f"{how}: negated levels", -k, 0.0, 0.0, "a gate is at least closed")
+        at_most(f"{how}: levels", k, float(levels), tolerance=0.0, why="a gate is at most fully open")
+        at_most(f"{how}: negated levels", -k, 0.0, tolerance=0.0, why="a gate is at least closed")
         equal(f"{how}: k / num_levels", gates.detach(), k / torch.tensor(float(levels)))
 
 
@@ -45,9 +45,9 @@ def check_gate_init_calibrated(part: GateSampler) -> None:
     p = torch.linspace(0.01, 0.99, 99)
     logits = part.init(torch.logit(p))
     opened = part.open_probability(logits)
-    at_most("confidence against open probability", p, opened, 1e-4, ROUNDING)
+    at_most("confidence against open probability", p, opened, tolerance=1e-4, why=ROUNDING)
     if part.num_levels == 1 and part.claims().stochastic:
-        equal("open probability of a binary gate", opened, p, 1e-4, ROUNDING)
+        equal("open probability of a binary gate", opened, p, tolerance=1e-4, why=ROUNDING)
 
 
 @check("gate", trait="stochastic")
@@ -92,9 +92,9 @@ def check_gate_noise_is_data(part: GateSampler) -> None:
 def check_gate_monotone(part: GateSampler) -> None:
     """A larger logit lowers neither the gate (same noise) nor the open probability."""
     low, high = part.init(_spread()), part.init(_spread() + 0.5)
-    at_most("open probability", part.open_probability(low), part.open_probability(high), 1e-6, ROUNDING)
+    at_most("open probability", part.open_probability(low), part.open_probability(high), tolerance=1e-6, why=ROUNDING)
     for (how, less), (_, more) in zip(_samples(part, low), _samples(part, high), strict=True):
-        at_most(f"gates {how}", less, more.detach(), 1e-6, ROUNDING)
+        at_most(f"gates {how}", less, more.detach(), tolerance=1e-6, why=ROUNDING)
 
 
 @check("gate", trait="differentiable")
@@ -105,7 +105,7 @@ def check_gate_gradient_flow(part: GateSampler) -> None:
         assert gates.requires_grad, f"gates {how} carry no gradient"
         (gradient,) = torch.autograd.grad(gates.sum(), logits)
         finite(f"gradient {how}", gradient)
-        at_most(f"negated gradient {how}", -gradient, 0.0, 0.0, "a gate never closes as its logit rises")
+        at_most(f"negated gradient {how}", -gradient, 0.0, tolerance=0.0, why="a gate never closes as its logit rises")
         if how == "without noise":
             alive = float((gradient > 0).float().mean())
             assert alive >= 0.9, f"gradient {how}: alive for {alive:.2f} of all |logits| <= 1; expected 0.9"
@@ -158,7 +158,7 @@ def check_gate_clamp(part: GateSampler) -> None:
     equal("bound(init(z))", part.bound(fresh), fresh)
     once = part.bound(_spread() * 10)
     equal("bound(bound(z))", part.bound(once), once)
-    at_most("order of bounded logits", once[:-1], once[1:], 0.0, "bounds keep the order")
+    at_most("order of bounded logits", once[:-1], once[1:], tolerance=0.0, why="bounds keep the order")
 
 
 @check("gate")
@@ -187,8 +187,8 @@ def check_gate_form(part: GateSampler) -> None:
     for name, (value, formula) in zip(("gates", "open probability"), pairs, strict=True):
         grad = torch.autograd.grad(value.sum(), logits)[0] if value.requires_grad else torch.zeros_like(logits)
         stated, derivative = formula(logits.detach())
-        equal(name, value.detach(), stated, 2e-6, ROUNDING)
-        equal(f"derivative of {name}", grad, derivative, 2e-6, ROUNDING)
+        equal(name, value.detach(), stated, tolerance=2e-6, why=ROUNDING)
+        equal(f"derivative of {name}", grad, derivative, tolerance=2e-6, why=ROUNDING)
     far = 100 * logits.detach()
     equal("bounds", part.bound(far), far.clamp(-form.bound, form.bound))
 

@@ -34,7 +34,7 @@ def _agrees(part: Loss, dssim: float, mask: torch.Tensor | None) -> None:
     (value, gradient), (want, wanted) = _evaluate(part, dssim, mask), _evaluate(ReferenceLoss(), dssim, mask)
     off = abs(value - want)
     assert off <= 1e-5, f"dssim {dssim}: expected a loss of {want:.7f}, got {value:.7f} (tolerance 1e-5: float32)"
-    relative(f"dssim {dssim}: gradient", gradient, wanted, 2e-3, WHY, floor=1e-5)
+    relative(f"dssim {dssim}: gradient", gradient, wanted, tolerance=2e-3, why=WHY, floor=1e-5)
 
 
 @check("loss")
@@ -52,10 +52,10 @@ def check_loss_mask(part: Loss) -> None:
     _agrees(part, 0.2, one)
     (value, gradient), (full, whole) = _evaluate(part, 0.2), _evaluate(part, 0.2, torch.ones(3, 3, dtype=torch.bool))
     assert abs(value - full) <= 1e-6, f"a full mask: expected {value:.7f} as without, got {full:.7f}"
-    equal("gradient with a full mask", whole, gradient, 1e-6, WHY)
+    equal("gradient with a full mask", whole, gradient, tolerance=1e-6, why=WHY)
     nothing, still = _evaluate(part, 0.2, torch.zeros(3, 3, dtype=torch.bool))
     assert nothing == 0.0, f"an empty mask: expected a loss of exactly 0, got {nothing!r}"
-    at_most("gradient with an empty mask", still.abs(), 0.0, 0.0, "no tile is compared")
+    at_most("gradient with an empty mask", still.abs(), 0.0, tolerance=0.0, why="no tile is compared")
 
 
 @check("loss", "takes_bytes")

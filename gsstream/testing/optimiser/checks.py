@@ -56,7 +56,7 @@ def check_optimiser_adam(part: RowOptimiser) -> None:
             adam.step()
             part.step(ours, gradients, states, lrs)
         for name, value in ours.items():
-            equal(f"{name} after {STEPS} steps", value, theirs[name].detach(), 1e-5, WHY)
+            equal(f"{name} after {STEPS} steps", value, theirs[name].detach(), tolerance=1e-5, why=WHY)
             assert bool((states[name].steps == STEPS).all()), f"{name}: expected {STEPS} steps to be counted"
 
 
@@ -73,7 +73,13 @@ def check_optimiser_rows(part: RowOptimiser) -> None:
     equal("steps of a table without a gradient", idle, torch.zeros_like(idle))
     equal("steps", states["means"].steps, torch.tensor([51] * 4 + [1] * 5, dtype=torch.int32))
     young = (before["means"] - values["means"])[4:]
-    equal("first step of a row", young, 0.01 * gradients["means"][4:].sign(), 1e-6, "Adam's first step is lr * sign")
+    equal(
+        "first step of a row",
+        young,
+        0.01 * gradients["means"][4:].sign(),
+        tolerance=1e-6,
+        why="Adam's first step is lr * sign",
+    )
 
 
 @check("optimiser")
@@ -119,7 +125,7 @@ def check_residual_optimiser(part: RowOptimiser) -> None:
     """
     code, base, units, matrix = _residual_case()
     subject = part.residual_optimiser(code, base, units, matrix)
-    truth = JointResidualOptimiser(code, base, units, matrix, part)
+    truth = JointResidualOptimiser(code=code, base=base, units=units, matrix=matrix, optimiser=part)
     g, rows = torch.Generator().manual_seed(8), len(base)
     for step in range(STEPS):
         if step == STEPS // 2:
@@ -130,16 +136,22 @@ def check_residual_optimiser(part: RowOptimiser) -> None:
         gates = torch.randint(0, 4, (rows,), generator=g) / 3
         ours, theirs = subject.forward(gates), truth.forward(gates)
         for (name, one), (_, other) in zip(ours.items(), theirs.items(), strict=True):
-            equal(f"{name} of step {step}", one, other, 1e-5, WHY)
+            equal(f"{name} of step {step}", one, other, tolerance=1e-5, why=WHY)
         grad = ours.map(lambda value: 1e-3 * torch.randn(value.shape, generator=g))
         weight = 1e-4 if step % 2 else 0.0
-        equal("gradient of the gates", subject.backward(grad, weight), truth.backward(grad, weight), 1e-5, WHY)
+        equal(
+            "gradient of the gates",
+            subject.backward(grad, weight),
+            truth.backward(grad, weight),
+            tolerance=1e-5,
+            why=WHY,
+        )
         for each in (subject, truth):
             each.latents.grad = torch.full((rows, code.width), 1e-5)
             each.step(0.9**step)
             assert each.latents.grad is None, "step(): expected what waits on the latents to be taken, got it left"
         _compare(subject, truth)
-    equal("position", subject.position.detach(), truth.position.detach(), 1e-4, WHY)
+    equal("position", subject.position.detach(), truth.position.detach(), tolerance=1e-4, why=WHY)
 
 
 @check("optimiser")
@@ -156,14 +168,14 @@ def check_residual_optimiser_run(part: RowOptimiser) -> None:
         code = joint_layout(codes, latents, {}, base)
         subject = part.residual_optimiser(code, base, torch.full((len(active),), 0.2), code.join_decoders({}))
         gates = TrainedGates(
-            ExampleGate(),
-            ExampleRegularizer(),
-            part,
-            0.05,
-            torch.ones(case.hierarchy.num_nodes),
-            case.hierarchy,
-            active,
-            torch.Generator().manual_seed(1),
+            gate=ExampleGate(),
+            regularizer=ExampleRegularizer(),
+            optimiser=part,
+            lr=0.05,
+            logits=torch.ones(case.hierarchy.num_nodes),
+            hierarchy=case.hierarchy,
+            rows=active,
+            generator=torch.Generator().manual_seed(1),
         )
         frozen = torch.arange(len(active)) % 4 == 0
         targets = [ViewTarget(loss, loss.prepare(image), 0.2, image) for image in case.now]
@@ -177,11 +189,11 @@ def check_residual_optimiser_run(part: RowOptimiser) -> None:
         found.append((subject, gates, torch.stack(made)))
     (subject, gates, losses), (truth, wanted, expected) = found
     _compare(subject, truth)
-    equal("logits", gates.logits.detach(), wanted.logits.detach(), 1e-4, WHY)
-    equal("losses", losses, expected, 1e-5, WHY)
+    equal("logits", gates.logits.detach(), wanted.logits.detach(), tolerance=1e-4, why=WHY)
+    equal("losses", losses, expected, tolerance=1e-5, why=WHY)
 
 
 def _compare(subject: ResidualOptimiser, truth: ResidualOptimiser) -> None:
-    equal("latents", subject.latents.detach(), truth.latents.detach(), 1e-4, WHY)
-    equal("decoders", subject.matrix, truth.matrix, 1e-4, WHY)
-    equal("curvature", subject.curvature, truth.curvature, 1e-4, WHY)
+    equal("latents", subject.latents.detach(), truth.latents.detach(), tolerance=1e-4, why=WHY)
+    equal("decoders", subject.matrix, truth.matrix, tolerance=1e-4, why=WHY)
+    equal("curvature", subject.curvature, truth.curvature, tolerance=1e-4, why=WHY)

@@ -46,18 +46,27 @@ def tiny_key(seed: int = 0, number: int = 40, nodes: int = 12) -> KeyState:
         return rng.normal(size=shape).astype(np.float32)
 
     scene = Gaussians(
-        normal(number, 3),
-        normal(number, 4),
-        normal(number, 3) - 3,
-        normal(number),
-        normal(number, 1, 3),
-        normal(number, 3, 3),
+        means=normal(number, 3),
+        quats=normal(number, 4),
+        scales=normal(number, 3) - 3,
+        opacities=normal(number),
+        sh0=normal(number, 1, 3),
+        shN=normal(number, 3, 3),
     )
     counts = np.bincount(rng.integers(0, nodes, number), minlength=nodes).astype(np.int32)
     layout = Layout(counts, rng.integers(0, 3, number).astype(np.uint8), np.array([1.0, 0.3, 0.1], np.float32))
     K = np.array([[50.0, 0, 16], [0, 51.0, 12], [0, 0, 1]])
-    rig = Cameras(("a", "b"), np.tile(np.eye(4), (2, 1, 1)), np.tile(K, (2, 1, 1)), 32, 24)
-    meta = StreamMeta("dense", "contract kit", {}, rig.select([0]), rig.select([1]), 30.0, (0.0, 0.0, 0.0), {})
+    rig = Cameras(ids=("a", "b"), viewmats=np.tile(np.eye(4), (2, 1, 1)), Ks=np.tile(K, (2, 1, 1)), width=32, height=24)
+    meta = StreamMeta(
+        method="dense",
+        source="contract kit",
+        recipe={},
+        train=rig.select([0]),
+        test=rig.select([1]),
+        fps=30.0,
+        background=(0.0, 0.0, 0.0),
+        plugins={},
+    )
     return KeyState(scene, layout, meta)
 
 

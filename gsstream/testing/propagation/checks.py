@@ -37,7 +37,7 @@ def check_propagation_range(part: Propagation) -> None:
         assert tuple(got.shape) == (m,), f"world {name!r}: expected shape [{m}], got {list(got.shape)}"
         finite(f"world {name!r}", got)
         why = f"{ROUNDING}; suspicion is spread, not invented"
-        at_most(f"world {name!r}", got[_owners(case.hierarchy)], float(case.logits.max()), 1e-4, why)
+        at_most(f"world {name!r}", got[_owners(case.hierarchy)], float(case.logits.max()), tolerance=1e-4, why=why)
 
 
 @check("propagation", trait="normalised")
@@ -46,14 +46,14 @@ def check_propagation_normalised(part: Propagation) -> None:
     case = get_case("cloud")
     for constant in (-3.0, 0.0, 2.5):
         got = _spread(part, case, torch.full_like(case.logits, constant))[_owners(case.hierarchy)]
-        equal(f"constant {constant}", got, torch.full_like(got, constant), 1e-5, ROUNDING)
+        equal(f"constant {constant}", got, torch.full_like(got, constant), tolerance=1e-5, why=ROUNDING)
 
 
 @check("propagation", trait="normalised")
 def check_propagation_flat_identity(part: Propagation) -> None:
     """On the flat structure nothing changes."""
     case = replace(get_case("cloud"), hierarchy=flat(len(get_case("cloud").logits)))
-    equal("flat structure", _spread(part, case), case.logits, 1e-6, ROUNDING)
+    equal("flat structure", _spread(part, case), case.logits, tolerance=1e-6, why=ROUNDING)
 
 
 @check("propagation")
@@ -65,7 +65,7 @@ def check_propagation_relabelling(part: Propagation) -> None:
     old_forest = case.hierarchy
     renamed = Hierarchy(new[old_forest.node_of], new[old_forest.parent[old]], old_forest.level[old])
     got = part.propagate(case.logits, renamed)
-    equal("renamed nodes", got, _spread(part, case)[old], 1e-5, ROUNDING)
+    equal("renamed nodes", got, _spread(part, case)[old], tolerance=1e-5, why=ROUNDING)
 
 
 @check("propagation")
@@ -76,7 +76,7 @@ def check_propagation_monotone(part: Propagation) -> None:
     for _ in range(4):
         some = torch.arange(len(case.logits)) % 5 == 0
         raised = _spread(part, case, case.logits + 4 * torch.rand(len(some), generator=g) * some)
-        at_most("lower confidences against raised ones", _spread(part, case), raised, 1e-5, ROUNDING)
+        at_most("lower confidences against raised ones", _spread(part, case), raised, tolerance=1e-5, why=ROUNDING)
 
 
 @check("propagation", trait="conservative")
@@ -85,7 +85,7 @@ def check_propagation_conservative(part: Propagation) -> None:
     for name in WORLDS:
         case = get_case(name)
         held = _spread(part, case)[case.hierarchy.node_of]
-        at_most(f"world {name!r}: members against their nodes", case.logits, held, 1e-5, ROUNDING)
+        at_most(f"world {name!r}: members against their nodes", case.logits, held, tolerance=1e-5, why=ROUNDING)
 
 
 @check("propagation")
@@ -107,7 +107,7 @@ def check_propagation_idempotent(part: Propagation) -> None:
     once = _spread(part, case)
     twice = _spread(part, case, once[case.hierarchy.node_of])
     owners = _owners(case.hierarchy)
-    equal("second pass", twice[owners], once[owners], 1e-5, ROUNDING)
+    equal("second pass", twice[owners], once[owners], tolerance=1e-5, why=ROUNDING)
 
 
 @check("propagation", trait="parent_bound")
@@ -115,7 +115,7 @@ def check_propagation_parent_bound(part: Propagation) -> None:
     """A parent's confidence is at least that of each of its children."""
     case = get_case("cloud")
     got = _spread(part, case)
-    at_most("children against their parents", got, got[case.hierarchy.parent], 1e-5, ROUNDING)
+    at_most("children against their parents", got, got[case.hierarchy.parent], tolerance=1e-5, why=ROUNDING)
 
 
 @check("propagation", trait="differentiable")

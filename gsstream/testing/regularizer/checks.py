@@ -44,7 +44,7 @@ def check_regularizer_scalar(part: Regularizer) -> None:
         for name, value in _terms(part, case).items():
             check_shape(f"term {name!r}", value, ())
             finite(f"term {name!r}", value)
-            at_most(f"negated term {name!r}", -value, 0.0, 0.0, "penalties are not rewards")
+            at_most(f"negated term {name!r}", -value, 0.0, tolerance=0.0, why="penalties are not rewards")
 
 
 @check("regularizer")
@@ -70,12 +70,18 @@ def check_regularizer_monotone(part: Regularizer) -> None:
     for node in range(0, case.hierarchy.num_nodes, 4):
         opened = _opened(case)
         opened[node] += 0.05
-        at_most(f"total before node {node} opens", before, float(_total(_terms(part, case, opened))), 1e-6, ROUNDING)
+        at_most(
+            f"total before node {node} opens",
+            before,
+            float(_total(_terms(part, case, opened))),
+            tolerance=1e-6,
+            why=ROUNDING,
+        )
     for row in range(0, len(case.residual), 40):
         residual = case.residual.clone()
         residual[row] *= 1.5
         after = float(_total(_terms(part, case, None, residual)))
-        at_most(f"total before residual {row} grows", before, after, 1e-6, ROUNDING)
+        at_most(f"total before residual {row} grows", before, after, tolerance=1e-6, why=ROUNDING)
 
 
 @check("regularizer", trait="weights")
@@ -89,7 +95,7 @@ def check_regularizer_linear_in_weight(part: Regularizer) -> None:
         return type(part)(part.config.model_copy(update=values))
 
     once, twice = _total(_terms(part, case)), _total(_terms(scaled(2.0), case))
-    equal("twice the weights", twice, 2 * once, 1e-5, ROUNDING)
+    equal("twice the weights", twice, 2 * once, tolerance=1e-5, why=ROUNDING)
     opened, residual = _opened(case).requires_grad_(True), case.residual.clone().requires_grad_(True)
     nothing = _total(_terms(scaled(0.0), case, opened, residual))
     equal("zero weights", nothing.detach(), torch.zeros_like(nothing))
@@ -122,11 +128,17 @@ def check_regularizer_reduction(part: Regularizer) -> None:
     both = Hierarchy(*(torch.cat([a, a + step]) for a, step in ((half.node_of, m), (half.parent, m), (half.level, 0))))
     terms = part.penalty(_opened(case).repeat(2), case.residual.repeat(2, 1), both, 2 * len(case.logits))
     factor = {"mean": 1.0, "sum": 2.0}[part.claims().reduction]
-    equal(f"reduction {part.claims().reduction!r}", _total(terms), factor * once, 1e-5, ROUNDING)
+    equal(f"reduction {part.claims().reduction!r}", _total(terms), factor * once, tolerance=1e-5, why=ROUNDING)
     many = Hierarchy(case.hierarchy.node_of.repeat(COPIES), case.hierarchy.parent, case.hierarchy.level)
     terms = part.penalty(_opened(case), case.residual.repeat(COPIES, 1), many, COPIES * len(case.logits))
     factor = {"mean": 1.0, "sum": float(COPIES)}[part.claims().reduction]
-    equal(f"{COPIES} times as many rows, one by one", _total(terms) / factor, once, 1e-5, "no digit is lost in a sum")
+    equal(
+        f"{COPIES} times as many rows, one by one",
+        _total(terms) / factor,
+        once,
+        tolerance=1e-5,
+        why="no digit is lost in a sum",
+    )
 
 
 @check("regularizer")
@@ -139,7 +151,7 @@ def check_regularizer_closed_rows(part: Regularizer) -> None:
     kept = ~closed[case.hierarchy.node_of]
     whole = _total(_terms(part, case, opened))
     active = part.penalty(opened, case.residual[kept], case.hierarchy.rows(kept), len(case.logits))
-    equal("active rows alone", _total(active), whole, 1e-5, ROUNDING)
+    equal("active rows alone", _total(active), whole, tolerance=1e-5, why=ROUNDING)
 
 
 @check("regularizer")
@@ -180,7 +192,7 @@ def check_regularizer_form(part: Regularizer) -> None:
     stated = form.grad(probability.detach(), residual.detach(), hierarchy, count)
     for name, leaf, one, other in zip(("probabilities", "residuals"), leaves, found, stated, strict=True):
         one = torch.zeros_like(leaf) if one is None else one
-        equal(f"gradient by {name}", one, other, 2e-6, ROUNDING)
+        equal(f"gradient by {name}", one, other, tolerance=2e-6, why=ROUNDING)
 
 
 def outputs(part: Regularizer, world: World) -> Outputs:

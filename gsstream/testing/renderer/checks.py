@@ -51,13 +51,13 @@ def check_renderer_range(part: Renderer) -> None:
         colours = 0.5 + 0.28209479177387814 * case.gaussians.sh0.reshape(-1)
         brightest = max(float(torch.cat([colours, torch.zeros(1)]).max()), max(GREY))
         why = "a weighted mean of colours, each at least 0"
-        at_most(f"world {name!r}: image", got.image, brightest, 1e-5, why)
-        dark = _draw(part, case.gaussians, case.cameras, 0, BLACK).image
-        at_most(f"world {name!r}: image below 0", -dark, 0.0, 1e-5, why)
-        at_most(f"world {name!r}: alpha", got.alpha, 1.0, 1e-5, "1 - transmittance")
-        at_most(f"world {name!r}: alpha below 0", -got.alpha, 0.0, 1e-5, "1 - transmittance")
+        at_most(f"world {name!r}: image", got.image, brightest, tolerance=1e-5, why=why)
+        dark = _draw(part, case.gaussians, case.cameras, view=0, behind=BLACK).image
+        at_most(f"world {name!r}: image below 0", -dark, 0.0, tolerance=1e-5, why=why)
+        at_most(f"world {name!r}: alpha", got.alpha, 1.0, tolerance=1e-5, why="1 - transmittance")
+        at_most(f"world {name!r}: alpha below 0", -got.alpha, 0.0, tolerance=1e-5, why="1 - transmittance")
     nothing = _draw(part, get_case("empty").gaussians, get_case("empty").cameras).image
-    equal("no Gaussians", nothing, torch.tensor(GREY).expand(SIZE, SIZE, 3), 1e-6, "the background alone")
+    equal("no Gaussians", nothing, torch.tensor(GREY).expand(SIZE, SIZE, 3), tolerance=1e-6, why="the background alone")
 
 
 @check("renderer")
@@ -68,9 +68,15 @@ def check_renderer_reference(part: Renderer) -> None:
         for view in range(len(case.cameras)):
             got, want = (_draw(each, case.gaussians, case.cameras, view) for each in (part, RENDERER))
             for what, a, b in (("image", got.image, want.image), ("alpha", got.alpha, want.alpha)):
-                equal(f"world {name!r}, camera {view}: {what}", a, b, CUT, "an alpha at the cut of 1/255 may go over")
+                equal(
+                    f"world {name!r}, camera {view}: {what}",
+                    a,
+                    b,
+                    tolerance=CUT,
+                    why="an alpha at the cut of 1/255 may go over",
+                )
                 mean = (a - b).abs().mean()
-                at_most(f"world {name!r}, camera {view}: mean error of {what}", mean, 0.0, 1e-4, SUMS)
+                at_most(f"world {name!r}, camera {view}: mean error of {what}", mean, 0.0, tolerance=1e-4, why=SUMS)
 
 
 @check("renderer")
@@ -84,7 +90,7 @@ def check_renderer_gradient(part: Renderer) -> None:
             drawn = each.render(leaves, case.cameras, view, GREY)
             (drawn.image * weights).sum().backward()  # type: ignore[no-untyped-call]
         a, b = (dict(leaves.map(gradient_of).items()) for leaves in (got, want))
-        gradients_equal(f"camera {view}", a, b, CUT, "an alpha at the cut of 1/255 may go over")
+        gradients_equal(f"camera {view}", a, b, tolerance=CUT, why="an alpha at the cut of 1/255 may go over")
 
 
 @check("renderer")
@@ -117,20 +123,20 @@ def check_renderer_screen_gradient(part: Renderer) -> None:
                 nudge[row, axis] = sign * eps
                 ends.append((RENDERER.nudged(double, case.cameras, 1, nudge).image * weights).sum())
             want[place, axis] = (ends[0] - ends[1]) / (2 * eps)
-    relative("gradient of the 2-D means", got.gradient[picked], want.float(), 5e-3, SUMS, floor=0.1)
+    relative("gradient of the 2-D means", got.gradient[picked], want.float(), tolerance=5e-3, why=SUMS, floor=0.1)
 
     case = get_case("unseen")
     got = part.screen_gradient(case.gaussians, case.cameras, 0, weights)
     hidden = case.gaussians.means[:, 1] > 10
     assert not bool(got.visible[hidden].any()), "Gaussians far outside the image are called visible"
-    at_most("gradient of what is not in view", got.gradient[hidden].abs(), 0.0, 0.0, EXACT)
+    at_most("gradient of what is not in view", got.gradient[hidden].abs(), 0.0, tolerance=0.0, why=EXACT)
     moved = (got.gradient != 0).any(1)
     assert not bool((moved & ~got.visible).any()), "a Gaussian has a gradient and is not called visible"
     session = part.open(case.gaussians, None, case.cameras, GREY)
     few, whole = session.screen_gradient_rows(0, weights), session.screen_gradient(0, weights).gradient
     assert bool((few.rows[1:] > few.rows[:-1]).all()), "screen_gradient_rows: rows that are not in ascending order"
     spread = torch.zeros_like(whole).index_copy(0, few.rows, few.gradient)
-    equal("screen_gradient_rows, against screen_gradient", spread, whole, 0.0, EXACT)
+    equal("screen_gradient_rows, against screen_gradient", spread, whole, tolerance=0.0, why=EXACT)
 
 
 @check("renderer")
@@ -189,19 +195,31 @@ def check_renderer_session(part: Renderer) -> None:
     for view in range(len(case.cameras)):
         session = part.open(case.gaussians, None, case.cameras, GREY)
         still = session.render(view, case.gaussians).image.detach().clone()
-        equal("wide session, nothing changed", still, _draw(part, case.gaussians, case.cameras, view).image, 1e-6, SUMS)
+        equal(
+            "wide session, nothing changed",
+            still,
+            _draw(part, case.gaussians, case.cameras, view).image,
+            tolerance=1e-6,
+            why=SUMS,
+        )
         session.narrow(active)
         rows = changed.rows(active).map(lambda v: v.detach().clone().requires_grad_())
         whole = changed.map(lambda v: v.detach().clone().requires_grad_())
         got, want = session.render(view, rows), part.render(whole, case.cameras, view, GREY)
-        equal(f"camera {view}: image", got.image.detach(), want.image.detach(), 1e-5, SUMS)
+        equal(f"camera {view}: image", got.image.detach(), want.image.detach(), tolerance=1e-5, why=SUMS)
         if got.tiles is not None:
             tiles = got.tiles.repeat_interleave(16, 0).repeat_interleave(16, 1)[:SIZE, :SIZE]
-            equal(f"camera {view}: outside the tiles named", got.image.detach()[~tiles], still[~tiles], 1e-6, SUMS)
+            equal(
+                f"camera {view}: outside the tiles named",
+                got.image.detach()[~tiles],
+                still[~tiles],
+                tolerance=1e-6,
+                why=SUMS,
+            )
         for output in (got, want):
             (output.image * weights).sum().backward()  # type: ignore[no-untyped-call]
         a, b = (dict(each.items()) for each in (rows.map(gradient_of), whole.map(gradient_of).rows(active)))
-        gradients_equal(f"camera {view}", a, b, 1e-4, SUMS)
+        gradients_equal(f"camera {view}", a, b, tolerance=1e-4, why=SUMS)
 
 
 @check("renderer")
@@ -228,7 +246,7 @@ def check_renderer_commit(part: Renderer) -> None:
         seen, expected = (each.visible(view, first) for each in (kept, fresh))
         equal(f"camera {view}: visible in the upper tiles", seen, expected)
         # Sums of gradients may run in no fixed order; images may not differ.
-        relative(f"camera {view}: screen gradient", a.gradient, b.gradient, 1e-5, SUMS, floor=0.1)
+        relative(f"camera {view}: screen gradient", a.gradient, b.gradient, tolerance=1e-5, why=SUMS, floor=0.1)
     for each in (kept, fresh):
         each.narrow(others)
     for view in range(len(case.cameras)):

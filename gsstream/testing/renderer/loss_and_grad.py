@@ -83,17 +83,17 @@ def transforms(count: int) -> GroupTransforms[torch.Tensor]:
 
 def compare(what: str, got: LossAndGrad[Any], want: LossAndGrad[Any], tolerance: float) -> None:
     """Fail unless two results have the same tensors, up to ``tolerance`` of the largest value of each."""
-    equal(f"{what}: loss", got.loss, want.loss, 1e-4, WHY)
+    equal(f"{what}: loss", got.loss, want.loss, tolerance=1e-4, why=WHY)
     if isinstance(want.grad, Gaussians):
         ours, theirs = (_given({**dict(found.grad.items()), "2-D means": found.means2d}) for found in (got, want))
-        gradients_equal(what, ours, theirs, tolerance, WHY)
+        gradients_equal(what, ours, theirs, tolerance=tolerance, why=WHY)
     else:
-        relative(f"{what}: gradient", got.grad, want.grad, tolerance, WHY, floor=MIN_GRADIENT)
+        relative(f"{what}: gradient", got.grad, want.grad, tolerance=tolerance, why=WHY, floor=MIN_GRADIENT)
     for name in ("curvature", "exposure"):
         one, other = getattr(got, name), getattr(want, name)
         assert (one is None) == (other is None), f"{what}: {name}: expected {other!r}, got {one!r}"
         if one is not None:
-            relative(f"{what}: {name}", one, other, tolerance, WHY, floor=MIN_GRADIENT)
+            relative(f"{what}: {name}", one, other, tolerance=tolerance, why=WHY, floor=MIN_GRADIENT)
 
 
 def _given(gradients: dict[str, torch.Tensor | None]) -> dict[str, torch.Tensor]:
@@ -144,7 +144,7 @@ def check_renderer_loss_and_grad_kept(part: Renderer) -> None:
         want = without.loss_and_grad(0, target, WrtScene(less, means2d=False))
         compare(what, replace(found, grad=found.grad.rows(keep), exposure=want.exposure), want, 1e-5)
         for attribute, value in found.grad.rows(~keep).items():
-            at_most(f"{what}: gradient of {attribute} of the others", value.abs(), 0.0, 0.0, EXACT)
+            at_most(f"{what}: gradient of {attribute} of the others", value.abs(), 0.0, tolerance=0.0, why=EXACT)
 
 
 @check("renderer")
@@ -162,15 +162,21 @@ def check_renderer_grad(part: Renderer) -> None:
         session.loss_and_grad(0, replace(target, tile_weights=weights.float()), WrtRows(rows))
         for weights in (left, ~left, left & ~left)
     )
-    at_most("loss where no tile counts", none.loss.abs(), 0.0, 0.0, EXACT)
+    at_most("loss where no tile counts", none.loss.abs(), 0.0, tolerance=0.0, why=EXACT)
     for name, value in first.items():
         assert getattr(leaves, name).grad is None, f"loss_and_grad: a gradient was left on the caller's {name}"
         equal(f"second gradient of {name}", getattr(again, name), value)
         if value.numel():
             both = getattr(one.grad, name) + getattr(other.grad, name)
             halves = f"gradient of {name}, two halves of the tiles"
-            relative(halves, both, value, NEAR, "sums in another order", floor=MIN_GRADIENT)
-            at_most(f"gradient of {name} where no tile counts", getattr(none.grad, name).abs(), 0.0, 0.0, EXACT)
+            relative(halves, both, value, tolerance=NEAR, why="sums in another order", floor=MIN_GRADIENT)
+            at_most(
+                f"gradient of {name} where no tile counts",
+                getattr(none.grad, name).abs(),
+                0.0,
+                tolerance=0.0,
+                why=EXACT,
+            )
 
 
 @check("renderer")
@@ -186,7 +192,7 @@ def check_renderer_grad_unseen(part: Renderer) -> None:
     alone = session.loss_and_grad(0, target, WrtRows(case.gaussians.rows(hidden))).grad
     for how, found in (("as a whole scene", whole), ("alone", alone)):
         for name, value in found.items():
-            at_most(f"gradient of {name} of what is not in view, {how}", value.abs(), 0.0, 0.0, EXACT)
+            at_most(f"gradient of {name} of what is not in view, {how}", value.abs(), 0.0, tolerance=0.0, why=EXACT)
 
 
 @check("renderer")

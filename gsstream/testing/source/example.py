@@ -14,7 +14,7 @@ def rig(ids: tuple[str, ...], size: int) -> Cameras:
     viewmats = np.tile(np.eye(4), (len(ids), 1, 1))
     viewmats[:, 0, 3] = [0.1 * place for place in range(len(ids))]
     K = np.array([[1.25 * size, 0, size / 2], [0, 1.25 * size, size / 2], [0, 0, 1]])
-    return Cameras(ids, viewmats, np.tile(K, (len(ids), 1, 1)), size, size)
+    return Cameras(ids=ids, viewmats=viewmats, Ks=np.tile(K, (len(ids), 1, 1)), width=size, height=size)
 
 
 class ExampleSource:
@@ -25,7 +25,15 @@ class ExampleSource:
             raise SourceError(f"{uri}: scale {scale} gives no whole number of pixels; expected 1, 0.5 or 0.25")
         self.size = int(scale * SIZE)
         train, test = rig(("left", "middle", "right"), self.size), rig(("test",), self.size)
-        self.info = SourceInfo("square", uri, FRAMES, 30.0, train, test, "made here, free for any use")
+        self.info = SourceInfo(
+            name="square",
+            uri=uri,
+            num_frames=FRAMES,
+            fps=30.0,
+            train=train,
+            test=test,
+            licence="made here, free for any use",
+        )
 
     def image(self, index: int, camera: str) -> np.ndarray:
         """Return [H, W, 3] float32 in [0, 1]; here every camera sees the same."""

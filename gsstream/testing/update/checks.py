@@ -80,18 +80,18 @@ def check_update_closed_loop(part: UpdateRule) -> None:
     table = torch.cat(list(latents.values()), 1) if latents else torch.zeros(n, 0)
     change = decode_joint(code, table, code.join_decoders(decoders), torch.full((n,), 0.25))
     features = join_features(code, case.gaussians)
-    trained = add_joint(code, case.gaussians, features, change, level / LEVELS)
+    trained = add_joint(code, case.gaussians, features, change=change, gates=level / LEVELS)
     rows = sent_rows(layout, level.numpy())
     integers: Mapping[str, torch.Tensor] = quantise_latents(codes, latents)
     residual = Residual(
-        level.numpy().astype(np.uint8),
-        LEVELS,
-        {name: value.numpy()[rows] for name, value in integers.items()},
-        {name: codes[name].step for name in integers},
-        sent,
+        gates=level.numpy().astype(np.uint8),
+        num_levels=LEVELS,
+        symbols={name: value.numpy()[rows] for name, value in integers.items()},
+        steps={name: codes[name].step for name in integers},
+        decoders=sent,
     )
     played = apply_residual(case.gaussians.map(lambda t: t.numpy()), layout, residual)
     assert fingerprint(case.gaussians) == before, "the scene before was changed in place"
     for name, value in played.items():
         want = torch.from_numpy(np.asarray(value))
-        equal(f"{name}", getattr(trained, name), want, 1e-5, "float32, products in another order")
+        equal(f"{name}", getattr(trained, name), want, tolerance=1e-5, why="float32, products in another order")

@@ -48,8 +48,8 @@ def read(folder: Path) -> Recording:
                 raise SourceError(f"{path}: camera {camera!r} is there twice, in {TRAIN} and {TEST} or within one")
             clips[camera] = ImageClip([folder / IMAGES / row[c] for row in files])
         ids += names
-        poses.append(_matrices(path, meta, "w2c", len(names), 4))
-        intrinsics.append(_matrices(path, meta, "k", len(names), 3))
+        poses.append(_matrices(path, meta, "w2c", cameras=len(names), side=4))
+        intrinsics.append(_matrices(path, meta, "k", cameras=len(names), side=3))
         test = tuple(names) if name == TEST else test
     if len(sizes) != 1:
         raise SourceError(f"{folder / TEST}: the size of the pictures differs from {TRAIN}: {sorted(sizes)}")

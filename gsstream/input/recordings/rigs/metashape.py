@@ -38,7 +38,7 @@ def read(path: Path, text: str) -> list[RigCamera]:
 def _camera(entry: ElementTree.Element, optics: Optics) -> RigCamera:
     K, lens, size = optics
     pose = np.array([float(word) for word in (entry.findtext("transform") or "").split()]).reshape(4, 4)
-    return RigCamera(Path(entry.attrib["label"]).stem, invert(pose), K, lens, size)
+    return RigCamera(name=Path(entry.attrib["label"]).stem, w2c=invert(pose), K=K, lens=lens, size=size)
 
 
 def _optics(path: Path, sensor: ElementTree.Element) -> Optics:

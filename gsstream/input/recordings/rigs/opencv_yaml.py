@@ -42,7 +42,15 @@ def read(path: Path, text: str) -> list[RigCamera]:
     sides = [str(data.get(key, "")) for key in ("image_width", "image_height")]
     if not all(side.isdigit() for side in sides):
         raise SourceError(f"{path}: expected image_width and image_height in pixels, got {sides}")
-    return [RigCamera(path.stem, w2c, from_pixel_centers(K.reshape(3, 3)), lens, (int(sides[0]), int(sides[1])))]
+    return [
+        RigCamera(
+            name=path.stem,
+            w2c=w2c,
+            K=from_pixel_centers(K.reshape(3, 3)),
+            lens=lens,
+            size=(int(sides[0]), int(sides[1])),
+        )
+    ]
 
 
 def _numbers(path: Path, data: dict[str, Any], keys: tuple[str, ...]) -> FloatArray:

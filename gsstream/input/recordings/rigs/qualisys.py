@@ -52,4 +52,10 @@ def _camera(path: Path, entry: ElementTree.Element) -> RigCamera:
     p1, p2 = (number(lens, f"tangentalDistortion{i}") for i in (1, 2))  # the format's own spelling
     K = np.array([[fx, 0, cx - left], [0, fy, cy - top], [0, 0, 1.0]])
     size = right - left + 1, bottom - top + 1
-    return RigCamera(name, OPENGL_TO_OPENCV @ w2c, from_pixel_centers(K), Lens("radial", tuple(radial), (p1, p2)), size)
+    return RigCamera(
+        name=name,
+        w2c=OPENGL_TO_OPENCV @ w2c,
+        K=from_pixel_centers(K),
+        lens=Lens("radial", tuple(radial), (p1, p2)),
+        size=size,
+    )

@@ -52,7 +52,7 @@ def _from_metadata(path: Path, root: ElementTree.Element) -> RigCamera:
     if not model.startswith("brown") and any(coefficients):
         raise SourceError(f"{path}: the lens model {model!r} is not supported; export with a model of Brown")
     u, v = numbers("PrincipalPointU")[0], numbers("PrincipalPointV")[0]
-    return _made(path, path.stem, w2c, (numbers("FocalLength35mm")[0] / FILM, u, v), coefficients)
+    return _made(path, path.stem, w2c, optics=(numbers("FocalLength35mm")[0] / FILM, u, v), coefficients=coefficients)
 
 
 def _from_row(path: Path, row: dict[str, str]) -> RigCamera:
@@ -63,7 +63,7 @@ def _from_row(path: Path, row: dict[str, str]) -> RigCamera:
     pose[:3, :3], pose[:3, 3] = z @ x @ y, [float(row[key]) for key in ("x", "y", "alt")]
     f, u, v = (float(row[key]) / FILM for key in ("f", "px", "py"))
     coefficients = [float(row[key]) for key in ("k1", "k2", "k3", "k4", "t1", "t2")]
-    return _made(path, Path(row["#name"]).stem, from_opengl(pose), (f, u, v), coefficients)
+    return _made(path, Path(row["#name"]).stem, from_opengl(pose), optics=(f, u, v), coefficients=coefficients)
 
 
 def _made(
@@ -74,4 +74,4 @@ def _made(
         raise SourceError(f"{path}: camera {name!r}: k4 is not supported: align with a model of Brown without it")
     f, u, v = optics
     K = np.array([[f, 0, u], [0, f, v], [0, 0, 1.0]])
-    return RigCamera(name, w2c, K, Lens("radial", (k1, k2, k3), (t1, t2)), None)
+    return RigCamera(name=name, w2c=w2c, K=K, lens=Lens("radial", (k1, k2, k3), (t1, t2)), size=None)

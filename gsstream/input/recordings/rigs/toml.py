@@ -51,4 +51,4 @@ def _camera(where: str, key: str, table: dict[str, Any]) -> RigCamera:
     if matrix.shape != (3, 3) or len(size) != 2:
         raise SourceError(f"{where}: expected matrix 3 x 3 and size (width, height), got {list(matrix.shape)}, {size}")
     lens = opencv_lens(coefficients, bool(table.get("fisheye", False)), where)
-    return RigCamera(name, w2c, from_pixel_centers(matrix), lens, (size[0], size[1]))
+    return RigCamera(name=name, w2c=w2c, K=from_pixel_centers(matrix), lens=lens, size=(size[0], size[1]))

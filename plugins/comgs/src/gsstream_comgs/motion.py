@@ -63,7 +63,7 @@ class KeyPointMotion(MotionPart):
         if number == 0:
             return ()
         chosen = torch.topk(difference, number).indices.sort().values
-        motion = _fitted(scene, work, rows, chosen, self.config, rng.numpy("comgs", work.index))
+        motion = _fitted(scene, work, rows, chosen=chosen, settings=self.config, order=rng.numpy("comgs", work.index))
         return () if motion is None else (motion,)
 
 
@@ -117,4 +117,4 @@ def _start(centres: torch.Tensor, pixel: float) -> KeyPoints:
     spacing = neighbour_distance(centres).clamp_min(2 * pixel) if number > 1 else torch.full((1,), 10 * pixel)
     rest, quat = torch.zeros(number, 3), torch.zeros(number, 4)
     quat[:, 0] = 1
-    return KeyPoints(centres.clone(), rest, rest, spacing.log()[:, None].repeat(1, 3), quat)
+    return KeyPoints(centre=centres.clone(), shift=rest, turn=rest, size=spacing.log()[:, None].repeat(1, 3), quat=quat)

@@ -26,7 +26,7 @@ class CpuAdam(RowOptimiser):
         lrs: Mapping[str, float | torch.Tensor],
     ) -> None:
         for name, gradient in gradients.items():
-            step_table(name, values[name].detach(), gradient, states[name], lrs[name])
+            step_table(name, values[name].detach(), gradient, state=states[name], lr=lrs[name])
 
     def residual_optimiser(
         self, code: JointLayout, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor

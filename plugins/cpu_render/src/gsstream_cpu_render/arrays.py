@@ -53,12 +53,12 @@ def require_splats(splats: SplatArrays, rows: int | None = None) -> SplatArrays:
     means = require_float32("means", splats.means, ("N" if rows is None else rows, 3))
     n = len(means)
     checked = SplatArrays(
-        means,
-        require_float32("quats", splats.quats, (n, 4)),
-        require_float32("scales", splats.scales, (n, 3)),
-        require_float32("opacities", splats.opacities, (n,)),
-        require_float32("sh0", splats.sh0, (n, 1, 3)),
-        require_float32("shN", splats.shN, (n, "K-1", 3)),
+        means=means,
+        quats=require_float32("quats", splats.quats, (n, 4)),
+        scales=require_float32("scales", splats.scales, (n, 3)),
+        opacities=require_float32("opacities", splats.opacities, (n,)),
+        sh0=require_float32("sh0", splats.sh0, (n, 1, 3)),
+        shN=require_float32("shN", splats.shN, (n, "K-1", 3)),
     )
     bases = checked.shN.shape[1] + 1
     if bases not in SH_COEFFICIENTS:

@@ -42,7 +42,7 @@ class NativeRasterizer:
         *,
         native: Any = None,
     ) -> None:
-        self._view = checked_view(viewmat, K, width, height, background, near)
+        self._view = checked_view(viewmat, K, width, height=height, background=background, near=near)
         self.width, self.height = self._view.width, self._view.height
         self._native = _native.Rasterizer() if native is None else native
         self._coefficients = 1
@@ -143,7 +143,7 @@ class NativeRasterizer:
         """
         self._expect("forward_active")
         rows = require_splats(rows, self._native.active_count)
-        comparison = self.comparison(cached_image, target, dssim_weight, colours, weights)
+        comparison = self.comparison(cached_image, target, dssim_weight, colours=colours, weights=weights)
         try:
             result = self._native.loss_and_grad_active(native_scene(rows), comparison, *out)
         except ValueError as error:
@@ -172,7 +172,7 @@ class NativeRasterizer:
             InputError: as forward; a loss that is not finite.
         """
         splats = require_splats(splats)
-        comparison = self.comparison(None, target, dssim_weight, colours, None)
+        comparison = self.comparison(None, target, dssim_weight, colours=colours, weights=None)
         camera = self._view[:-1]  # the background is the comparison's
         try:
             result = _native.full_loss_and_grad(

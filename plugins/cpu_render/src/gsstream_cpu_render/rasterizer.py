@@ -44,7 +44,9 @@ def render_numpy(
         InputError: wrong shapes, values that are not finite, a quaternion without direction.
     """
     splats = SplatArrays(*(np.ascontiguousarray(part, np.float32) for part in arrays))
-    return NumpyRasterizer(viewmat, K, width, height, background, near).forward(splats)[0]
+    return NumpyRasterizer(viewmat=viewmat, K=K, width=width, height=height, background=background, near=near).forward(
+        splats
+    )[0]
 
 
 class NumpyRasterizer(NativeRasterizer):

@@ -56,4 +56,4 @@ class CpuRenderer(Renderer):
     ) -> RenderSession:
         megabytes = self.config.cache_mb
         budget = None if megabytes is None else int(megabytes * MEGABYTE)
-        return CpuSession(gaussians, active, cameras, background, budget)
+        return CpuSession(gaussians=gaussians, active=active, cameras=cameras, background=background, budget=budget)

@@ -100,8 +100,8 @@ class CpuResidualOptimiser(ResidualOptimiser):
             self._latents.grad = None
         self._pending = None
         lrs, decoder_lrs = lr_factor * self._code.lrs, lr_factor * self._code.decoder_lrs
-        step_table("latents", self._latents.detach(), latents, self._states["latents"], lrs)
-        step_table("matrix", self._matrix, matrix, self._states["matrix"], decoder_lrs)
+        step_table("latents", self._latents.detach(), latents, state=self._states["latents"], lr=lrs)
+        step_table("matrix", self._matrix, matrix, state=self._states["matrix"], lr=decoder_lrs)
 
     def run(self, epoch: ResidualEpoch) -> list[torch.Tensor]:
         made: list[torch.Tensor] = []

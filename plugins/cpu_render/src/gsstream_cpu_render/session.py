@@ -180,7 +180,9 @@ class CpuSession(RenderSession):
                 "open a new session when rows are added or removed"
             )
         ids, order = _ascending(changed)
-        after = CpuSession(gaussians, None, self._cameras, self._background, self._budget)
+        after = CpuSession(
+            gaussians=gaussians, active=None, cameras=self._cameras, background=self._background, budget=self._budget
+        )
         after._refused = self._refused
         views, self._views = self._views, {}
         if len(ids):

@@ -35,12 +35,12 @@ def checked_view(
             empty or huge image.
     """
     view = View(
-        _matrix("viewmat", viewmat, 4),
-        _matrix("K", K, 3),
-        int(width),
-        int(height),
-        float(near),
-        np.asarray(background, np.float32),
+        viewmat=_matrix("viewmat", viewmat, 4),
+        K=_matrix("K", K, 3),
+        width=int(width),
+        height=int(height),
+        near=float(near),
+        background=np.asarray(background, np.float32),
     )
     fx, fy, skew = view.K[0, 0], view.K[1, 1], view.K[0, 1]
     if not (fx > 0 and fy > 0):

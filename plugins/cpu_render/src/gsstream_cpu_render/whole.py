@@ -21,7 +21,12 @@ def loss_and_grad_of_scene(
     by_exposure = None if target.exposure is None else np.empty(12, np.float32)
     out = (*splats_of(grad), means2d.numpy())
     loss = held.rasterizer.full_loss_and_grad(
-        splats_of(rows), target.prepared, target.dssim, exposure_arrays(target), out, by_exposure
+        splats_of(rows),
+        target.prepared,
+        target.dssim,
+        colours=exposure_arrays(target),
+        out=out,
+        exposure_grad=by_exposure,
     )
     return LossAndGrad(
         torch.tensor(loss, dtype=torch.float64),

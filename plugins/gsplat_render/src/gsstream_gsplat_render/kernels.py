@@ -69,11 +69,11 @@ def load_kernels(device: str) -> Kernels:
     try:
         gsplat = importlib.import_module("gsplat")
         kernels = Kernels(
-            gsplat.fully_fused_projection,
-            gsplat.spherical_harmonics,
-            gsplat.isect_tiles,
-            gsplat.isect_offset_encode,
-            gsplat.rasterize_to_pixels,
+            project=gsplat.fully_fused_projection,
+            harmonics=gsplat.spherical_harmonics,
+            tiles=gsplat.isect_tiles,
+            offsets=gsplat.isect_offset_encode,
+            rasterize=gsplat.rasterize_to_pixels,
         )
         # gsplat binds its kernels on the first call, so one is made here and not in the middle of a run.
         kernels.harmonics(0, torch.ones(1, 3, device=device), torch.ones(1, 1, 3, device=device))

@@ -58,7 +58,9 @@ class GsplatRenderer(Renderer):
         self, gaussians: Gaussians[torch.Tensor], active: torch.Tensor | None, cameras: Cameras, background: Background
     ) -> RenderSession:
         kernels, rigs = load_kernels(self.config.device), rigs_on(self.config.device)
-        return GsplatSession(kernels, rigs, gaussians, active, cameras, background)
+        return GsplatSession(
+            kernels=kernels, rigs=rigs, gaussians=gaussians, active=active, cameras=cameras, background=background
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +115,7 @@ class GsplatSession(RenderSession):
         whole, whole_probe = self._merged(_moved(rows, self._rigs.device), probe)
         mask = None if tile_mask is None else _checked_mask(tile_mask, target).to(self._rigs.device)
         if self._active is None or len(whole) == 0:
-            drawn = draw(self._kernels, whole, target, whole_probe, mask)
+            drawn = draw(self._kernels, whole, target, probe=whole_probe, mask=mask)
             return RenderOutput(drawn.image.to(home), drawn.alpha.to(home))
         seen = project(self._kernels, whole, target, whole_probe)
         shown, tiles = self._shown_before(view)
@@ -140,7 +142,14 @@ class GsplatSession(RenderSession):
         self._before = {view: replace(before, tiles=None) for view, before in self._before.items()}
 
     def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
-        return GsplatSession(self._kernels, self._rigs, gaussians, None, self._cameras, self._background)
+        return GsplatSession(
+            kernels=self._kernels,
+            rigs=self._rigs,
+            gaussians=gaussians,
+            active=None,
+            cameras=self._cameras,
+            background=self._background,
+        )
 
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
         """By a scene on black, so the background has no share in it."""

@@ -67,13 +67,13 @@ def project(
     colors = _colors(kernels, gaussians, view, visible)
     # Squeezed and not indexed: the gradient of a view is a view, that of an index is a copy.
     return Projected(
-        visible.squeeze(0),
-        means2d.squeeze(0),
-        depths.squeeze(0),
-        conics.squeeze(0),
-        colors.squeeze(0),
-        opacities,
-        radii.squeeze(0),
+        visible=visible.squeeze(0),
+        means2d=means2d.squeeze(0),
+        depths=depths.squeeze(0),
+        conics=conics.squeeze(0),
+        colors=colors.squeeze(0),
+        opacities=opacities,
+        radii=radii.squeeze(0),
     )
 
 

@@ -81,8 +81,18 @@ class CoherentMotion(MotionPart):
             transforms = _warm_started(scene, start, transforms, config.momentum)
             # Half a cell from its centre, a rotation of one unit moves a Gaussian by a pixel, too.
             unit = np.repeat([pixel, pixel / side], 3)
-            found = fit_transforms_adam(work, transforms, unit, [lr] * iterations, order, measure, config.l1_weight)
-            motion = rounded_motion(groups, able, found, config.step * pixel, config.step * pixel / side)
+            found = fit_transforms_adam(
+                work,
+                transforms,
+                unit,
+                rates=[lr] * iterations,
+                order=order,
+                measure=measure,
+                l1_weight=config.l1_weight,
+            )
+            motion = rounded_motion(
+                groups, able, found, translation_step=config.step * pixel, rotation_step=config.step * pixel / side
+            )
             if motion is None:
                 continue
             motions.append(motion)

@@ -24,7 +24,7 @@ def _flip(pair: ViewPair) -> float:
 def _flicker(pair: ViewPair) -> float:
     if pair.last_image is None or pair.last_truth is None:
         return math.nan
-    return flicker(pair.image, pair.last_image, pair.truth, pair.last_truth, pair.sigma)
+    return flicker(pair.image, pair.last_image, pair.truth, last_truth=pair.last_truth, sigma=pair.sigma)
 
 
 EXTRAS: Mapping[str, ViewMetric] = {"ms_ssim": _ms_ssim, "flip": _flip, "flicker": _flicker}

@@ -33,7 +33,9 @@ class ChangeGatedCopies(Growth):
 
     def propose(self, after: Scene, work: FitContext, rng: Rng) -> RowEdit | None:
         rows = least_opaque(after, len(after.gaussians) - work.key_rows)
-        return replace_with_copies(after, rows, work, self.config, rng, partial(self.admitted, work.key_rows))
+        return replace_with_copies(
+            after, rows, work, settings=self.config, rng=rng, admitted=partial(self.admitted, work.key_rows)
+        )
 
     def admitted(self, kept: int, work: FitContext, rows: torch.Tensor) -> torch.Tensor:
         """Return which of ``rows`` may be copied, in their order, in a scene whose rows from ``kept`` on are copies."""

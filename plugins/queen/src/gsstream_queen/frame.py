@@ -64,13 +64,13 @@ class _Frame:
         self._cameras: Cameras = problem.work.cameras
         self._extent = self._cameras.extent
         self._old = OldRows(
-            config,
-            self._scene.rows(problem.active),
-            problem.logits,
-            problem.weights,
-            self._extent,
-            len(self._scene),
-            self._cameras.width * self._cameras.height,
+            config=config,
+            base=self._scene.rows(problem.active),
+            logits=problem.logits,
+            weights=problem.weights,
+            extent=self._extent,
+            total=len(self._scene),
+            pixels=self._cameras.width * self._cameras.height,
         )
         self._new: list[NewRows] = []
         #: Rows of the scene that a split replaced.
@@ -124,10 +124,10 @@ class _Frame:
                 rows,
                 self._statistics.mean,
                 allowed,
-                config.max_added - added_so_far,
-                self._extent,
-                config,
-                self._generator,
+                room=config.max_added - added_so_far,
+                extent=self._extent,
+                settings=config,
+                generator=self._generator,
             )
         self._statistics = DensifyStatistics.zeros(len(self._problem.active), self._problem.active.device)
         if len(new.gaussians) == 0:
@@ -159,4 +159,4 @@ class _Frame:
         gone = self._gone.clone()
         if self._config.growth.every:
             gone[active[faint]] |= self._problem.dynamic[active[faint]]
-        return Result(self._old.solution(), added, gone, loss, iterations)
+        return Result(solution=self._old.solution(), added=added, gone=gone, loss=loss, iterations=iterations)

@@ -88,15 +88,15 @@ class Queen(StreamingMethod[QueenState]):
         with tools.log.phase("optimise"):
             logits = initial_logits(change.difference, change.seen, self.config.gate)[active]
             problem = Problem(
-                work,
-                tools.renderer,
-                tools.background,
-                active,
-                dynamic,
-                self._masks(work, dynamic, tools),
-                logits,
-                state.weights,
-                tools.epochs(frame),
+                work=work,
+                renderer=tools.renderer,
+                background=tools.background,
+                active=active,
+                dynamic=dynamic,
+                masks=self._masks(work, dynamic, tools),
+                logits=logits,
+                weights=state.weights,
+                epochs=tools.epochs(frame),
             )
             result = optimise(self.config, problem, tools.rng.stream("queen", frame.index))
         with tools.log.phase("code"):
@@ -136,7 +136,9 @@ class Queen(StreamingMethod[QueenState]):
         steps = {name: self.config.means.step if name == "means" else 1.0 for name in symbols}
         learned = {n: v.numpy() for n, v in result.solution.decoders.items() if n in symbols}
         rows = RowEdit(added_of(result.added, len(layout.node_counts)), np.flatnonzero(result.gone.numpy()))
-        return Delta((Residual(gates, 1, symbols, steps, quantise_decoders(learned)),)).with_row_edit(rows)
+        return Delta(
+            (Residual(gates=gates, num_levels=1, symbols=symbols, steps=steps, decoders=quantise_decoders(learned)),)
+        ).with_row_edit(rows)
 
 
 def added_of(added: Gaussians[torch.Tensor], nodes: int) -> AddedGaussians | None:

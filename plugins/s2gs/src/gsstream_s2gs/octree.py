@@ -125,14 +125,18 @@ class StreamingOctree(Structure):
             unique, index = torch.unique(keys >> 3 * (levels - 1 - level), return_inverse=True)
             shift = 0.5 if self.config.anchor == "center" else 0.0
             where = origin + (morton.decode(unique) + shift) * cell
-            keep = self._wanted(where, centers, level, levels, far)
+            keep = self._wanted(where, centers, level, levels=levels, far=far)
             positions.append(where[keep])
             colors.append(_cell_colors(rgb, index, len(unique), self.config.color)[keep])
             level_of.append(torch.full((int(keep.sum()),), level))
         depth = torch.arange(levels, dtype=torch.float64) if self.config.unit == "cell" else torch.zeros(levels)
         sizes = side / 2.0 ** (self.config.root_exponent + depth.double())
         anchors = Anchors(
-            torch.cat(positions).float(), torch.cat(colors).float(), torch.cat(level_of), sizes.float(), origin.float()
+            positions=torch.cat(positions).float(),
+            colors=torch.cat(colors).float(),
+            levels=torch.cat(level_of),
+            cell_sizes=sizes.float(),
+            origin=origin.float(),
         )
         check_finite("cell_sizes", anchors.cell_sizes)
         if float(anchors.cell_sizes[-1]) <= 0:

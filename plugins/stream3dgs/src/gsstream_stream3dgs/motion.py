@@ -110,17 +110,17 @@ class CacheMotion(MotionPart):
         # A scene that is flat along an axis has a box all the same.
         high = np.maximum(high, low + np.maximum(np.float32(1e-3 * extent), np.float32(1e-6) * np.abs(low)))
         return FieldShape(
-            (float(low[0]), float(low[1]), float(low[2])),
-            (float(high[0]), float(high[1]), float(high[2])),
-            float(np.float32(config.reach * extent)),
-            config.levels,
-            config.entries,
-            config.features,
-            config.base,
-            float(np.float32(config.growth)),
-            config.width,
-            2,
-            rng.key("stream3dgs", 0) & 0xFFFFFFFF,
+            low=(float(low[0]), float(low[1]), float(low[2])),
+            high=(float(high[0]), float(high[1]), float(high[2])),
+            reach=float(np.float32(config.reach * extent)),
+            levels=config.levels,
+            entries=config.entries,
+            features=config.features,
+            base=config.base,
+            growth=float(np.float32(config.growth)),
+            width=config.width,
+            layers=2,
+            seed=rng.key("stream3dgs", 0) & 0xFFFFFFFF,
         )
 
     def said(self, scene: Scene, rows: IntArray, cache: Cache, work: FitContext) -> Field | Motion | None:
@@ -137,8 +137,8 @@ class CacheMotion(MotionPart):
             scene,
             rows,
             work.shell_rows,
-            (cache.shape.reach * shift).numpy(),
-            turn.numpy(),
-            side,
-            self.config.step * pixel,
+            translation=(cache.shape.reach * shift).numpy(),
+            rotation=turn.numpy(),
+            side=side,
+            step=self.config.step * pixel,
         )

@@ -155,7 +155,7 @@ def _balls(plan: FramePlan, parts: Assembly, static: int, progress: Progress) ->
     for share in plan.shares:
         progress(f"{static / 1000:g}k static Gaussians: which ball changes {share:.0%} of the tiles")
         name = "everything moves" if share >= 1 else f"{share:.0%} of tiles"
-        cases.append((name, _Ball(_FRONT, _radius_for(plan, parts, scene, rig, before, share))))
+        cases.append((name, _Ball(_FRONT, _radius_for(plan, parts, scene, rig=rig, before=before, share=share))))
     return cases
 
 
@@ -196,7 +196,7 @@ def _case(plan: FramePlan, parts: Assembly, static: int, ball: _Ball) -> _Case:
 
 
 def _encoder(parts: Assembly, rig: Cameras, first: PlayerState | None = None) -> Encoder:
-    info = SourceInfo("synthetic", "bench", None, 30.0, rig, rig.select([]))
+    info = SourceInfo(name="synthetic", uri="bench", num_frames=None, fps=30.0, train=rig, test=rig.select([]))
     return Encoder(parts, info, first_frame=first)
 
 
@@ -219,7 +219,16 @@ def _first_player(parts: Assembly, scene: Gaussians[FloatArray], rig: Cameras) -
     cell = np.float32(np.exp(np.median(scene.scales)))
     layout = Layout(np.ones(count, np.int32), np.zeros(count, np.uint8), np.array([cell], np.float32))
     extra = {"origin": scene.means.min(0).tolist()}
-    meta = StreamMeta("bench", "synthetic", {}, rig, rig.select([]), 30.0, parts.background, extra=extra)
+    meta = StreamMeta(
+        method="bench",
+        source="synthetic",
+        recipe={},
+        train=rig,
+        test=rig.select([]),
+        fps=30.0,
+        background=parts.background,
+        extra=extra,
+    )
     return decode_packet(None, encode_key(KeyState(scene, layout, meta), frame=0).data)
 
 

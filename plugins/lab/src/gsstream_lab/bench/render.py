@@ -106,7 +106,7 @@ def bench_render(plan: RenderPlan, catalog: Catalog, progress: Progress) -> dict
             if name == "reference" and size.gaussians * size.width * size.height > REFERENCE_LIMIT:
                 skipped.append({"renderer": name, "size": str(size), "why": "too slow here, and not extrapolated"})
                 continue
-            cases += _cases(plan, scene, name, part, natives[name])
+            cases += _cases(plan, scene, name, part=part, native=natives[name])
         for threads in plan.threads:
             progress(f"size {number} of {len(plan.sizes)}: {size}, {threads} threads, {len(cases)} cases")
             results += _timed(plan, cases, threads, natives)
@@ -131,7 +131,14 @@ def _scene(plan: RenderPlan, size: Size) -> _Scene:
     camera = arc_rig(1, size.width, size.height)
     prints = footprints(gaussians, camera)
     upstream = Rng(plan.seed).numpy("bench gradient").normal(size=(size.height, size.width, 3)).astype(np.float32)
-    scene = _Scene(size, gaussians, camera, prints, live_pairs(prints), upstream / np.float32(upstream.size))
+    scene = _Scene(
+        size=size,
+        gaussians=gaussians,
+        camera=camera,
+        prints=prints,
+        pairs=live_pairs(prints),
+        v_image=upstream / np.float32(upstream.size),
+    )
     scene.masks = {share: central_tiles(size.width, size.height, share) for share in plan.shares}
     return scene
 
@@ -159,7 +166,7 @@ def _cases(plan: RenderPlan, scene: _Scene, name: str, part: Renderer, native: N
             active = None if path == "all rows" else scene.prints.in_tiles(scene.masks[share])
             if active is not None and not len(active):
                 continue
-            facts = _facts(scene, name, share, path, active)
+            facts = _facts(scene, name, share, path=path, active=active)
             cases.append(_Case({**facts, "level": "part"}, _part_steps(scene, part, mask, active)))
             if native is not None:
                 kernel = _kernel(scene, native, mask, active)

@@ -70,14 +70,14 @@ def footprints(gaussians: Gaussians[FloatArray], cameras: Cameras, view: int = 0
         seen &= (depths > cameras.near_plane) & (reach >= 0)
         triangle = torch.stack([conics[:, 0, 0], conics[:, 0, 1], conics[:, 1, 1]], 1)
     return Footprints(
-        means2d.numpy(),
-        half.numpy(),
-        triangle.numpy(),
-        depths.numpy(),
-        opacities.numpy(),
-        seen.numpy(),
-        cameras.width,
-        cameras.height,
+        means2d=means2d.numpy(),
+        half=half.numpy(),
+        conics=triangle.numpy(),
+        depths=depths.numpy(),
+        opacities=opacities.numpy(),
+        visible=seen.numpy(),
+        width=cameras.width,
+        height=cameras.height,
     )
 
 

@@ -116,4 +116,10 @@ def arc_rig(views: int, width: int, height: int) -> Cameras:
         viewmat[:3, 3] = (0, 0, 2.4) - viewmat[:3, :3] @ np.asarray(OBJECT_CENTER)
     focal = 0.5 * width / np.tan(np.deg2rad(30))
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Cameras(tuple(f"bench{i}" for i in range(views)), viewmats, np.tile(K, (views, 1, 1)), width, height)
+    return Cameras(
+        ids=tuple(f"bench{i}" for i in range(views)),
+        viewmats=viewmats,
+        Ks=np.tile(K, (views, 1, 1)),
+        width=width,
+        height=height,
+    )

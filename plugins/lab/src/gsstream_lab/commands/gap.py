@@ -64,7 +64,7 @@ def gap(
     recording = open_recording(source or named_recording(file, meta, catalog), recipe, catalog)
     try:
         check_cameras(meta, recording.info)
-        fresh = FreshFrames.of_run(recipe, recording, cache or run / "fresh", catalog, epochs)
+        fresh = FreshFrames.of_run(recipe, recording, cache or run / "fresh", catalog=catalog, epochs=epochs)
         for frame in chosen:
             _make(fresh, frame, quiet)
         files = {frame: fresh.file(frame).resolve() for frame in chosen}

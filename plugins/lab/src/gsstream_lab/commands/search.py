@@ -55,7 +55,15 @@ def search(
     ladders = _ladders(tried) or usual_ladders(parts.recipe)
     start = {key: value_of(parts, key) for key in ladders}
     ladders = {key: values if start[key] in values else (start[key], *values) for key, values in ladders.items()}
-    score = SweepScore(recording.scene(1), method, seed, out, catalog.recipe_path, where.executor, progress(quiet))
+    score = SweepScore(
+        scene=recording.scene(1),
+        method=method,
+        seed=seed,
+        out=out,
+        find_method=catalog.recipe_path,
+        executor=where.executor,
+        say=progress(quiet),
+    )
     found = climb(start, ladders, score)
     key = next(iter(ladders))
     (point,) = make_plan(score.config(found, key, [found[key]]), Path(), catalog.recipe_path).points

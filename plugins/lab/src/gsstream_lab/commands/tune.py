@@ -65,8 +65,8 @@ def tune(
     plan = make_plan(pilot(recording.scene(FRAMES), tried, limits, seed), Path(), catalog.recipe_path)
     if first_frame is not None:
         give_first_frame(plan, out, stream_file(first_frame))
-    trials = _run(plan, limits, out, workers, quiet)
-    _tell(plan, trials, limits, out, recording)
+    trials = _run(plan, limits, out, workers=workers, quiet=quiet)
+    _tell(plan, trials, limits, out=out, recording=recording)
 
 
 def _limits(recipe: Recipe, source: str) -> Budget:

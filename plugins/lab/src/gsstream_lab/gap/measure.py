@@ -146,7 +146,10 @@ def default_frames(frames: Sequence[int]) -> list[int]:
 
 def _pictures(playback: Playback, frame: int, renderer: PlayerRenderer) -> list[FloatArray]:
     scene, meta = playback.state_at(frame), playback.meta
-    return [np.clip(render(scene, meta.test, i, meta.background, renderer), 0, 1) for i in range(len(meta.test))]
+    return [
+        np.clip(render(scene, meta.test, i, background=meta.background, renderer=renderer), 0, 1)
+        for i in range(len(meta.test))
+    ]
 
 
 def _cell(value: float, column: str) -> str:

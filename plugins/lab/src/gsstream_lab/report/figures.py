@@ -58,7 +58,7 @@ def pareto_figure(groups: Sequence[Group], title: str) -> bytes:
     for row, good in enumerate(goods):
         for column, cost in enumerate(costs):
             axis = axes[row, column]
-            _panel(axis, groups, good, cost, looks)
+            _panel(axis, groups, good, cost=cost, looks=looks)
             for name in variants if joined else ():
                 line = sorted((group.mean(cost), group.mean(good)) for group in groups if group.variant == name)
                 axis.plot(*zip(*line, strict=True), color=looks[name][0], linewidth=1, alpha=0.6)

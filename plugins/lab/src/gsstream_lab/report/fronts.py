@@ -84,7 +84,7 @@ def effects(groups: Sequence[Group], keys: Sequence[str]) -> list[Effect]:
         for base, knob in _references(changed, groups):
             deltas = {key: changed.mean(key) - base.mean(key) for key in keys}
             ties = {key: is_tie(base, changed, key, noise[key]) for key in keys}
-            found.append(Effect(base, changed, knob, deltas, ties))
+            found.append(Effect(base=base, changed=changed, knob=knob, deltas=deltas, ties=ties))
     return found
 
 

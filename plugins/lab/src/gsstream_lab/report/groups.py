@@ -90,7 +90,8 @@ def read_sweep_data(folder: Path) -> SweepData:
         row = table.cells.get(point["cell"])
         key = json.dumps([point["scene"], point["variant"], point["axes"]])
         if row is None or row["status"] != "done":
-            label = f"{Group(point['scene'], point['variant'], point['axes'], (), words).label} seed {point['seed']}"
+            group = Group(scene=point["scene"], variant=point["variant"], axes=point["axes"], runs=(), words=words)
+            label = f"{group.label} seed {point['seed']}"
             if row is None:
                 missing.append(f"{point['scene']} {label}")
             else:
@@ -98,15 +99,21 @@ def read_sweep_data(folder: Path) -> SweepData:
             continue
         row = {**row, "first_seconds": _first_seconds(row, table)}
         records = tuple(record_of(frame) for frame in row["frames"])
-        run = Run(point["cell"], point["seed"], row, records, values_of(records, row))
+        run = Run(id=point["cell"], seed=point["seed"], row=row, records=records, values=values_of(records, row))
         found.setdefault(key, []).append((point, run))
     if not found:
         raise InputError(f"{folder}: no cell has finished yet ({len(failed)} failed); nothing to report")
     groups = tuple(
-        Group(items[0][0]["scene"], items[0][0]["variant"], items[0][0]["axes"], tuple(run for _, run in items), words)
+        Group(
+            scene=items[0][0]["scene"],
+            variant=items[0][0]["variant"],
+            axes=items[0][0]["axes"],
+            runs=tuple(run for _, run in items),
+            words=words,
+        )
         for items in found.values()
     )
-    return SweepData(table.plan["config"], groups, failed, tuple(missing), table)
+    return SweepData(config=table.plan["config"], groups=groups, failed=failed, missing=tuple(missing), table=table)
 
 
 def _first_seconds(row: Mapping[str, Any], table: TableData) -> float | None:

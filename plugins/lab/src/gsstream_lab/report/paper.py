@@ -44,7 +44,15 @@ def paper_table(name: str) -> PaperTable:
         for row, values in table["rows"].items()
     }
     machine = table.get("machine", content["machine"])
-    return PaperTable(name, table["title"], table["data"], machine, content["source"], columns, rows)
+    return PaperTable(
+        name=name,
+        title=table["title"],
+        data=table["data"],
+        machine=machine,
+        source=content["source"],
+        columns=columns,
+        rows=rows,
+    )
 
 
 def beside_ours(

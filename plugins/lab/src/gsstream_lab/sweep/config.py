@@ -217,7 +217,7 @@ def _read(path: Path, model: type[Model]) -> Model:
         return Origin(str(path), str(path))
 
     problems: list[str] = []
-    config = validate(model, values, origin, (), problems)
+    config = validate(model, values, origin, prefix=(), problems=problems)
     join_problems(problems, str(path))
     assert config is not None, "an invalid sweep leaves at least one problem"
     return config

@@ -51,7 +51,7 @@ def run_sweep(
         shutil.rmtree(out / WORK, ignore_errors=True)
         (out / WORK).mkdir()
         try:
-            return _Drive(plan, out, executor, data, say).run()
+            return _Drive(plan=plan, out=out, executor=executor, data=data, say=say).run()
         finally:
             executor.close()
             shutil.rmtree(out / WORK, ignore_errors=True)
@@ -98,7 +98,15 @@ class _Drive:
         if isinstance(task, FirstFrameRun):
             return Job(task.id, uri, task.resolved, work=work, alone=alone)
         first = first_frame_file(self.out, task.first).read_bytes() if task.first else None
-        return Job(task.id, uri, task.resolved, first, self.plan.config.measure, work, alone)
+        return Job(
+            id=task.id,
+            uri=uri,
+            resolved=task.resolved,
+            first_frame=first,
+            measure=self.plan.config.measure,
+            work=work,
+            alone=alone,
+        )
 
     def _after_first_frame(self, task: FirstFrameRun, finished: Finished) -> None:
         outcome = finished.outcome or Outcome(task.id, error=finished.reason)

@@ -102,13 +102,13 @@ def _run(job: Job, folder: Path) -> Outcome:
     machine, when = _machine(parts)
     facts |= {**when, "cell_seconds": time.perf_counter() - started, "threads": os.environ.get("GSSTREAM_THREADS")}
     return Outcome(
-        job.id,
-        tuple(frames),
-        parts.recipe.model_dump(mode="json"),
-        recipe_hash(parts.recipe),
-        (folder / STREAM).read_bytes(),
-        machine,
-        facts,
+        id=job.id,
+        frames=tuple(frames),
+        recipe=parts.recipe.model_dump(mode="json"),
+        recipe_hash=recipe_hash(parts.recipe),
+        stream=(folder / STREAM).read_bytes(),
+        machine=machine,
+        run=facts,
     )
 
 

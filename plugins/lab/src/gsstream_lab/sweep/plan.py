@@ -82,11 +82,13 @@ def make_plan(config: SweepConfig, folder: Path, find_method: FindMethod) -> Pla
     firsts: dict[str, FirstFrameRun] = {}
     for scene, seed in itertools.product(config.scenes, _all_seeds(config)):
         leader = config.variants[0]
-        lead = _resolve(config, scene, leader, {}, seed, folder, find_method)
+        lead = _resolve(config, scene, leader, axes={}, seed=seed, folder=folder, find_method=find_method)
         for variant in config.variants:
             recorded = _recorded(scene, variant, seed)
             for axes in _points(config, variant, seed):
-                resolved = _resolve(config, scene, variant, axes, seed, folder, find_method)
+                resolved = _resolve(
+                    config, scene, variant, axes=axes, seed=seed, folder=folder, find_method=find_method
+                )
                 first = None
                 if config.first_frame.share != "own":
                     shared = config.first_frame.share == "scene"
@@ -95,7 +97,13 @@ def make_plan(config: SweepConfig, folder: Path, find_method: FindMethod) -> Pla
                     first = firsts.setdefault(made.id, made).id
                 points.append(
                     Cell(
-                        _cell_id(config, recorded, resolved, first), recorded, variant.name, axes, seed, resolved, first
+                        id=_cell_id(config, recorded, resolved, first),
+                        scene=recorded,
+                        variant=variant.name,
+                        axes=axes,
+                        seed=seed,
+                        resolved=resolved,
+                        first=first,
                     )
                 )
     return Plan(config, tuple(points), firsts)

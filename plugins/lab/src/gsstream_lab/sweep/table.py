@@ -55,7 +55,13 @@ def read_table(path: Path) -> TableData:
             found[str(kind)][row["id"]] = row
         else:
             raise InputError(f"{path}:{number}: expected a record of a sweep with an id, got {str(row)[:80]}")
-    return TableData(plan, found["machine"], found["recipe"], found["first_frame"], found["cell"])
+    return TableData(
+        plan=plan,
+        machines=found["machine"],
+        recipes=found["recipe"],
+        first_frames=found["first_frame"],
+        cells=found["cell"],
+    )
 
 
 def _rows(text: str, path: Path) -> Iterator[tuple[int, Mapping[str, Any]]]:

@@ -113,7 +113,7 @@ def trial_of(name: str, row: Mapping[str, Any], budget: Budget) -> Trial:
     costs = zip(sizes, seconds, memory, strict=True)
     inside = sum(all(cost <= limit for cost, limit in zip(frame, limits, strict=True)) for frame in costs)
     whole, moving = (mean_of_views(later, name) for name in ("psnr", "psnr_moving"))
-    return Trial(name, whole, moving, sizes, seconds, max(memory), inside)
+    return Trial(name=name, psnr=whole, moving=moving, sizes=sizes, seconds=seconds, memory=max(memory), inside=inside)
 
 
 def choose(trials: Sequence[Trial]) -> Trial | None:

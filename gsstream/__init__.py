@@ -14,7 +14,7 @@ __version__ = "0.1.0"
 
 #: Version of the plugin interface (hooks, abstract base classes, Protocols): "major.minor".
 #: Another major is refused, a newer minor is refused with "upgrade gsstream", an older minor is fine.
-API_VERSION = "2.0"
+API_VERSION = "3.0"
 
 _DOORS = ("api", "blocks", "encode", "play", "spec", "testing")
 

@@ -50,7 +50,7 @@ from gsstream.core.part import Part as Part
 from gsstream.core.part import PartConfig as PartConfig
 from gsstream.core.part import Traits as Traits
 from gsstream.core.part import unwrapped as unwrapped
-from gsstream.core.picture_size import is_large as is_large
+from gsstream.core.picture_size import COMPACT_PIXELS as COMPACT_PIXELS
 from gsstream.core.rng import Rng as Rng
 from gsstream.core.shapes import FloatArray as FloatArray
 from gsstream.core.shapes import IntArray as IntArray

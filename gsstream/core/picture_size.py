@@ -12,14 +12,26 @@ import math
 
 #: Width, and number of pixels, of the pictures for which settings are given.
 WIDTH, PIXELS = 320, 320 * 240
-#: Width from which a picture is large: what lies away from a change is then told without its pixels, what a loss keeps
-#: of its target may be rounded to 16 bits, and what a Gaussian covers has a price.
-LARGE = 960
+#: Widths up to which a picture is small, and from which it is large. Between them every rule goes from one to the other
+#: with the logarithm of the width, so that no two widths that are close to each other are encoded differently.
+SMALL, LARGE = 640, 1280
+#: Number of pixels from which a loss may keep what it computes of its target as 16-bit codes, to save memory. No digit
+#: that a player shows depends on the codes.
+COMPACT_PIXELS = 1 << 19
 
 
-def is_large(width: int) -> bool:
-    """Return whether a picture is so large that memory and time count for more than its last digits."""
-    return width >= LARGE
+def largeness(width: int) -> float:
+    """Return how far a picture of this width is from small to large, 0 to 1."""
+    return min(max(math.log(width / SMALL) / math.log(LARGE / SMALL), 0.0), 1.0)
+
+
+def far_weight(width: int) -> float:
+    """Return the weight, 0 to 1, of tiles away from every change in what a residual is compared with.
+
+    In small pictures, these tiles keep what stands still from wearing away over many frames. In large ones, rows that
+    change reach half as many tiles more for them, a sixth of the time of a residual.
+    """
+    return 1.0 - largeness(width)
 
 
 def enlargement(width: int) -> float:
@@ -41,16 +53,16 @@ def densify_factor(width: int) -> float:
     A Gaussian of a given number of pixels has a smaller part in the mean over a larger picture. Where what is covered
     has a price (:func:`area_price`), a lower threshold gives back the Gaussians that the price takes.
     """
-    return math.pow(enlargement(width), -0.5) * (0.8 if area_price(width) else 1.0)
+    return math.pow(enlargement(width), -0.5) * math.pow(0.8, largeness(width))
 
 
 def area_price(width: int) -> float:
     """Return what one Gaussian more at every pixel costs in frame 0, in units of the loss.
 
-    Only large pictures have this price: there, blending is most of the time. In pictures 320 and 640 wide it saves
-    bytes and time, too, but costs 0.1 to 0.3 dB on training cameras left out.
+    Small pictures have no such price: in pictures 320 and 640 wide it saves bytes and time, but costs 0.1 to 0.3 dB on
+    training cameras left out. In large pictures, blending is most of the time.
     """
-    return 2e-4 if is_large(width) else 0.0
+    return 2e-4 * largeness(width)
 
 
 def prune_factor(width: int) -> float:

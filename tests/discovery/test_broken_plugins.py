@@ -10,9 +10,9 @@ REASONS = {
     "raises_at_import": "ModuleNotFoundError: No module named 'a_package_nobody_has'",
     "exits_at_import": "SystemExit: no licence found",
     "unspeakable": "Unspeakable: its message cannot be read: RuntimeError",
-    "other_major": "from-the-future: built for component API 3.0, this gsstream speaks 2.0: upgrade gsstream",
-    "newer_minor": "newer-gate: built for component API 2.3, this gsstream speaks 2.0: upgrade gsstream",
-    "older_major": "from-the-past: built for component API 1.0, this gsstream speaks 2.0: ask its author for a "
+    "other_major": "from-the-future: built for component API 4.0, this gsstream speaks 3.0: upgrade gsstream",
+    "newer_minor": "newer-gate: built for component API 3.3, this gsstream speaks 3.0: upgrade gsstream",
+    "older_major": "from-the-past: built for component API 1.0, this gsstream speaks 3.0: ask its author for a "
     "newer version",
     "duplicate_name": "declares the gate 'always-open', which gsstream 0.1.0 already provides; rename it",
     "unknown_hook": "implements the hook 'gsstream_component', which this gsstream does not know; did you mean "
@@ -20,7 +20,7 @@ REASONS = {
     "wrong_arguments": "PluginValidationError: Plugin 'gsstream_wrong_arguments_plugin' for hook 'gsstream_components' "
     "hookimpl definition: gsstream_components(registry) Argument(s) {'registry'} are declared in the hookimpl but ",
     "wrong_return": "gsstream_components() returned a str in its list; expected ComponentSpec",
-    "bad_spec": "ValidationError: ComponentSpec of component API 2.0: kind: Input should be 'structure', 'confidence', "
+    "bad_spec": "ValidationError: ComponentSpec of component API 3.0: kind: Input should be 'structure', 'confidence', "
     "'propagation', 'gate', 'motion', 'update', 'growth', 'regularizer', 'streaming_method', 'renderer', 'loss', "
     "'optimiser' or 'source', got 'gatte'",
     "command_clash": "declares the command 'run', which gsstream 0.1.0 already provides; rename it",

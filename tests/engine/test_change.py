@@ -120,10 +120,10 @@ def test_blocks_noise_and_tiles_are_those_of_numpy(kind: str, size: tuple[int, i
 
 
 @pytest.mark.parametrize("uri", ["demo", "synthetic:frames=4&views=3&width=100&height=75&noise=0.01"])
-@pytest.mark.parametrize("large", [1, 960])
-def test_tiles_of_recordings_are_those_of_numpy(uri: str, large: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """``large`` is the width from which several views are compared at a time."""
-    monkeypatch.setattr("gsstream.core.picture_size.LARGE", large)
+@pytest.mark.parametrize("pixels", [1, 1 << 19])
+def test_tiles_of_recordings_are_those_of_numpy(uri: str, pixels: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``pixels`` is the number of them from which several views are compared at a time."""
+    monkeypatch.setattr("gsstream.engine.step.active.change.THREADED_PIXELS", pixels)
     source = open_source(uri)
     first, second = source.frame(0), source.frame(3)
     change = detect_changed_tiles(first, second, THRESHOLD)

@@ -119,5 +119,5 @@ def test_only_what_the_view_drew_pays_for_what_it_covers() -> None:
 
 
 def test_only_large_pictures_have_a_price() -> None:
-    assert area_price(320) == area_price(959) == 0.0
-    assert area_price(960) == area_price(4096) > 0
+    assert area_price(320) == area_price(640) == 0.0
+    assert area_price(1280) == area_price(4096) > 0

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from gsstream.core.errors import InputError
-from gsstream.core.picture_size import is_large
+from gsstream.core.picture_size import COMPACT_PIXELS
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.recipe.model import Recipe
@@ -74,6 +74,6 @@ def _with_cache(assembly: Assembly, megabytes: float) -> Assembly:
 def _fixed(info: SourceInfo, recipe: Recipe) -> int:
     # Images that are read at their own size are taken for 8-bit ones, as nearly all are.
     waiting = WAITING / 4 if recipe.scale == 1 else WAITING + 1  # one frame is read before it is stored
-    statistics = 1 if is_large(info.train.width) else 2
+    statistics = 1 if info.train.width * info.train.height >= COMPACT_PIXELS else 2
     images = (waiting + statistics) * len(info.train) + 4 * len(info.test) + WORKING
     return PROCESS + round(images * 12 * info.train.width * info.train.height)

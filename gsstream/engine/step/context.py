@@ -13,7 +13,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.log import FrameLog
-from gsstream.core.picture_size import is_large
+from gsstream.core.picture_size import far_weight
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.constants import DSSIM
 from gsstream.engine.fit.frame_images import FrameImages
@@ -178,18 +178,21 @@ class EngineContext:
         self._assembly.where.count()  # a target is asked for once in every iteration
         return self.photometric.view_target(view, tile_weights)
 
-    def changed_target(self, view: int) -> ViewTarget:
-        """Return what a render of this view is compared with in the tiles that changed, and in those beside them."""
-        return self.view_target(view, None if self._change is None else self._change.dilated[view].float())
+    def changed_target(self, view: int, far: float = 0.0) -> ViewTarget:
+        """Return what a render of this view is compared with in the tiles that changed, and in those beside them.
+
+        All other tiles have the weight ``far``, 0 to 1.
+        """
+        if self._change is None or far == 1.0:
+            return self.view_target(view)
+        return self.view_target(view, self._change.dilated[view].float().clamp_min(far))
 
     def residual_target(self, view: int) -> ViewTarget:
-        """Return what the residual's render of this view is compared with.
+        """Return what the residual's render of this view is compared with; the larger the picture, the less of it.
 
-        In large pictures, only where something changed: rows reach half as many tiles more, which cost a sixth of the
-        time of a residual, and only keep from wearing away over many frames what stands still
-        (docs/results/extremes.md).
+        :func:`gsstream.core.picture_size.far_weight` is the rule, docs/results/extremes.md what was measured.
         """
-        return self.changed_target(view) if is_large(self.cameras.width) else self.view_target(view)
+        return self.changed_target(view, far_weight(self.cameras.width))
 
     def on(self, gaussians: Gaussians[torch.Tensor], session: RenderSession | None = None) -> EngineContext:
         # The loss of the same images and the votes that were counted are shared, not made again.

@@ -5,7 +5,7 @@ from gsstream.spec import ComponentSpec, hookimpl
 
 @hookimpl
 def gsstream_components():
-    return [ComponentSpec(kind="gate", name="newer-gate", target="nowhere:Gate", summary="a gate", api="2.3")]
+    return [ComponentSpec(kind="gate", name="newer-gate", target="nowhere:Gate", summary="a gate", api="3.3")]
 
 
 @hookimpl

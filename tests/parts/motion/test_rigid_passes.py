@@ -98,17 +98,22 @@ def test_motions_look_near_the_change() -> None:
     assert set(asked) == {"changed"}
 
 
-@pytest.mark.parametrize(("large", "changed_alone"), [(960, False), (1, True)])
-def test_residuals_of_large_pictures_are_compared_where_something_changed(
-    large: int, changed_alone: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("far", [1.0, 0.25, 0.0])
+def test_the_larger_the_picture_the_less_of_it_is_compared_with_a_residual(
+    far: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     work = fit_fixture().work
-    monkeypatch.setattr("gsstream.core.picture_size.LARGE", large)
-    assert work._change is not None
+    monkeypatch.setattr("gsstream.engine.step.context.far_weight", lambda width: far)
+    tiles = torch.zeros(len(work.cameras), 5, 7, dtype=torch.bool)
+    tiles[:, 2, 3] = True
+    work._change = Change(tiles, 5 * 16, 7 * 16)
     weights = work.residual_target(0).tile_weights
-    assert (weights is not None) == changed_alone
+    assert (weights is None) == (far == 1.0)
     if weights is not None:
-        assert torch.equal(weights > 0, work._change.dilated[0])
+        near = work._change.dilated[0]
+        assert bool((weights[near] == 1).all())
+        assert bool((weights[~near] == far).all())
+        assert 0 < int(near.sum()) < near.numel()
     assert work.everywhere().residual_target(0).tile_weights is None, "a residual of every row is compared everywhere"
 
 

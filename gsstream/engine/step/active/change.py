@@ -12,7 +12,6 @@ import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame
-from gsstream.core.picture_size import is_large
 from gsstream.core.processors import processors
 from gsstream.core.shapes import BoolArray, FloatArray, IntArray
 from gsstream.core.storage import unpacked
@@ -23,6 +22,8 @@ from gsstream.parts.render.base import TILE
 MIN_BLOCKS = 2
 #: Upper bound on the noise of one pixel of one image; see MOST_SIGMA of blocks.
 MAX_PIXEL_SIGMA = 16 / 255
+#: Number of pixels from which several views are compared at a time: with fewer, threads take longer than they save.
+THREADED_PIXELS = 1 << 19
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,7 @@ def detect_changed_tiles(previous: Frame, frame: Frame, threshold: float) -> Cha
         return _changed(changed_blocks(previous.images[view], frame.images[view], threshold))
 
     cameras, views = frame.cameras, range(len(frame.cameras))
-    if is_large(cameras.width):  # in small pictures threads take longer than they save
+    if cameras.width * cameras.height >= THREADED_PIXELS:
         with ThreadPoolExecutor(processors()) as pool:
             tiles = list(pool.map(of, views))
     else:

@@ -6,7 +6,7 @@ from typing import Any, final
 
 import torch
 
-from gsstream.api import Loss, LossTraits, is_large
+from gsstream.api import COMPACT_PIXELS, Loss, LossTraits
 from gsstream_cpu_render.loss import PreparedImage, photometric_loss
 
 
@@ -19,7 +19,8 @@ class CpuLoss(Loss):
     traits = LossTraits(takes_bytes=True)
 
     def prepare(self, target: torch.Tensor) -> Any:
-        return PreparedImage(target.detach().numpy(), compact=is_large(target.shape[1]))
+        compact = target.shape[0] * target.shape[1] >= COMPACT_PIXELS
+        return PreparedImage(target.detach().numpy(), compact=compact)
 
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None

@@ -1,7 +1,7 @@
 """What crosses the wire: key, delta and empty packets in an append-only file. Imports no torch.
 
 ``encode_*`` and ``decode_*`` are pure functions between records and complete packets; :class:`StreamWriter` and
-:class:`StreamReader` put packets into a file and find them again. Normative text: docs/reference/packet-format.md.
+:class:`StreamReader` put packets into a file and find them again. Normative text: docs/spec.
 """
 
 from gsstream.core.digest import hash_recipe as hash_recipe

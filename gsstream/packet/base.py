@@ -1,4 +1,4 @@
-"""What a packet is: kinds, sections, limits, the fixed header and its check. Normative text: packet-format.md."""
+"""What a packet is: kinds, sections, limits, the fixed header and its check. Normative text: docs/spec."""
 
 from __future__ import annotations
 
@@ -28,8 +28,10 @@ FREE_GAUSSIANS = 1 << 16
 MAX_GAUSSIANS_PER_BYTE = 64
 MAX_BODY = 1 << 30
 MAX_SECTIONS = 16
-MAX_META = 16 << 20
+MAX_META = 1 << 20
 MAX_UNITS = 64
+#: Units stay below this, so that no residual leads out of the range of float32.
+MAX_UNIT = 1e9
 MAX_CHANNELS = 64
 WIDTHS: Mapping[str, tuple[int, ...]] = {
     "means": (3,),

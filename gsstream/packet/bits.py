@@ -131,12 +131,13 @@ def decompress(data: bytes, limit: int) -> bytes:
     """Return what :func:`compress` was given. The announced size is checked against ``limit`` before allocating."""
     try:
         size = zstandard.frame_content_size(data)
+        dictionary = zstandard.get_frame_parameters(data).dict_id
     except zstandard.ZstdError as error:
         raise PacketError(f"not a zstandard frame: {error}") from error
+    if data[:4] != zstandard.FRAME_HEADER or dictionary:
+        raise PacketError("expected a zstandard frame without a dictionary")
     if size < 0 or size > limit:
         raise PacketError(f"compressed part announces {size} bytes; expected at most {limit}")
-    if size == 0:
-        return b""
     try:
         # The window is bounded by the content size in frames of known size, so this allocates about `size` bytes.
         out: bytes = zstandard.ZstdDecompressor().decompress(data, max_output_size=size, allow_extra_data=False)

@@ -14,6 +14,7 @@ from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.packet.base import (
     MAX_GAUSSIANS,
     MAX_META,
+    MAX_UNIT,
     MAX_UNITS,
     EncodedPacket,
     PacketKind,
@@ -100,8 +101,15 @@ def _check_layout(gaussians: Gaussians[FloatArray], layout: Layout) -> None:
         raise ShapeError(f"layout: expected {number} Gaussians, got nodes holding {nodes} and {len(unit_of)} units")
     if len(layout.node_counts) > MAX_GAUSSIANS or len(layout.units) > MAX_UNITS:
         raise ShapeError(f"layout: at most {MAX_GAUSSIANS} nodes and {MAX_UNITS} units")
+    if not _sound(np.asarray(layout.units, np.float32)):
+        raise ShapeError(f"layout: units: expected numbers above 0 and below {MAX_UNIT:g}, got {layout.units}")
     if number and int(np.max(unit_of)) >= len(layout.units):
         raise ShapeError(f"layout: expected units 0 to {len(layout.units) - 1}, got {int(np.max(unit_of))}")
+
+
+def _sound(units: FloatArray) -> bool:
+    # R-3.5-3; not a number is neither above nor below.
+    return bool(((units > 0) & (units < MAX_UNIT)).all())
 
 
 def _encode_layout(layout: Layout) -> bytes:
@@ -133,6 +141,6 @@ def _decode_layout(data: bytes, most: int) -> Layout:
         raise PacketError(f"layout: units {int(unit_of.min())} to {int(unit_of.max())}, {number_of_units} are given")
     if number and not nodes:
         raise PacketError(f"layout: {number} Gaussians in no node")
-    if not (np.isfinite(units).all() and (units > 0).all()):
-        raise PacketError("layout: units must be finite and positive")
+    if not _sound(units):
+        raise PacketError(f"layout: units: expected numbers above 0 and below {MAX_UNIT:g}")
     return Layout(np.ascontiguousarray(counts), unit_of.astype(np.uint8), units)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -15,10 +16,14 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.digest import hash_recipe
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.names import check_camera_ids
+from gsstream.core.shapes import FloatArray
 from gsstream.core.world import IDENTITY, World
+from gsstream.packet.base import MAX_META
 
 MAX_SIDE, MAX_PIXELS = 1 << 16, 1 << 27
 MIN_FPS, MAX_FPS = 0.01, 100_000.0
+#: Arrays and objects within each other; a parser may need much memory or stack for more.
+MAX_DEPTH = 100
 #: Conventions every value of a stream of this format follows.
 CONVENTIONS: Mapping[str, str] = {
     "viewmats": "world-to-camera, OpenCV axes", "Ks": "pixels, pixel-corner origin", "quats": "wxyz",
@@ -93,13 +98,22 @@ def meta_to_json(meta: StreamMeta) -> bytes:
     }  # fmt: skip
     if not meta.world.is_identity:
         data["world"] = asdict(meta.world)
-    return json.dumps(data, separators=(",", ":"), allow_nan=False, default=_plain).encode()
+    text = json.dumps(data, separators=(",", ":"), allow_nan=False, default=_plain).encode()
+    if len(text) > MAX_META or _nested_too_deep(text):
+        raise ShapeError(
+            f"meta: expected at most {MAX_META} bytes of JSON, nested at most {MAX_DEPTH} deep, got {len(text)} bytes: "
+            "recipe or extra is too large"
+        )
+    return text
 
 
 def meta_from_json(data: bytes) -> StreamMeta:
     """Return the meta of which :func:`meta_to_json` made these bytes. Raises PacketError (without offset)."""
     try:
-        value = json.loads(data, parse_constant=_refuse, parse_float=_finite)
+        if _nested_too_deep(data):
+            raise ValueError(f"arrays and objects lie more than {MAX_DEPTH} deep within each other")
+        # As text: of bytes, the parser would guess the encoding.
+        value = _object(json.loads(data.decode("utf-8"), parse_constant=_refuse, parse_float=_finite))
         meta = StreamMeta(
             method=_text(value["method"]),
             source=_text(value["source"]),
@@ -129,8 +143,7 @@ def _check(meta: StreamMeta) -> None:
     """Everything that must hold of a stream's meta besides its types. Raises TypeError or ValueError."""
     if not MIN_FPS <= meta.fps <= MAX_FPS:
         raise ValueError(f"fps: expected {MIN_FPS:g} to {MAX_FPS:g} frames per second, got {meta.fps!r}")
-    if not all(math.isfinite(value) for value in meta.background):
-        raise ValueError(f"background: expected three finite numbers, got {meta.background}")
+    _check_single("background", meta.background)
     if not len(meta.train) + len(meta.test):
         raise ValueError("there is no camera; expected at least one in train or test")
     for rig in (meta.train, meta.test):
@@ -140,12 +153,40 @@ def _check(meta: StreamMeta) -> None:
                 raise ValueError(f"image size {rig.width} x {rig.height}: expected 1 to {MAX_SIDE} pixels a side")
         if rig.width * rig.height > MAX_PIXELS:
             raise ValueError(f"image size {rig.width} x {rig.height}: expected at most {MAX_PIXELS} pixels")
+        _check_single("viewmats", rig.viewmats)
+        _check_single("Ks", rig.Ks)
+        _check_single("near", [rig.near_plane], above_zero=True)
+        _check_single("focal lengths", rig.Ks[:, [0, 1], [0, 1]], above_zero=True)
     meta.world.validate()
     for name, version in meta.plugins.items():
         _text(name), _text(version)
     for key in ("source_uri", "licence", "title"):
         _text(meta.extra.get(key, ""))
     _check_encoder_s_own(meta)
+
+
+def _check_single(name: str, values: Any, *, above_zero: bool = False) -> None:
+    """Raise ValueError unless numbers are finite, and above 0 if they must be, in the float32 of renderers."""
+    with np.errstate(over="ignore", under="ignore"):
+        single = np.asarray(values, np.float64).astype(np.float32)
+    if not (np.isfinite(single) & ((single > 0) | (not above_zero))).all():
+        wanted = "finite numbers above 0" if above_zero else "finite numbers"
+        raise ValueError(f"{name}: expected {wanted} in float32, got {np.ravel(values)}")
+
+
+def _nested_too_deep(text: bytes) -> bool:
+    """Say whether more than MAX_DEPTH arrays and objects of a JSON text lie within each other."""
+    depth = 0
+    for found in _STRUCTURE.finditer(text):
+        sign = found[0][:1]
+        depth += (sign in b"[{") - (sign in b"]}")
+        if depth > MAX_DEPTH:
+            return True
+    return False
+
+
+#: A text, whatever is in it and also without an end, or one bracket. It takes one way through any input.
+_STRUCTURE = re.compile(rb'"[^"\\]*(?:\\.[^"\\]*)*"?|[\[\]{}]', re.DOTALL)
 
 
 def _check_encoder_s_own(meta: StreamMeta) -> None:
@@ -184,9 +225,10 @@ def _rig(cameras: Cameras) -> dict[str, Any]:
 
 
 def _cameras(value: Any) -> Cameras:
-    ids = tuple(_text(name) for name in value["ids"])
-    viewmats = np.asarray(value["viewmats"], np.float64).reshape(len(ids), 4, 4)
-    Ks = np.asarray(value["Ks"], np.float64).reshape(len(ids), 3, 3)
+    value = _object(value)
+    ids = tuple(_text(name) for name in _list(value["ids"]))
+    viewmats = _matrices(value["viewmats"], len(ids), 4)
+    Ks = _matrices(value["Ks"], len(ids), 3)
     cameras = Cameras(
         ids=ids,
         viewmats=viewmats,
@@ -199,13 +241,22 @@ def _cameras(value: Any) -> Cameras:
     return cameras
 
 
+def _matrices(value: Any, number: int, side: int) -> FloatArray:
+    """[number, side, side] from a list of lists of numbers, row by row."""
+    rows = [[_number(v) for v in _list(row)] for row in _list(value)]
+    if len(rows) != number or any(len(row) != side * side for row in rows):
+        raise ValueError(f"cameras: expected {number} matrices of {side * side} numbers")
+    return np.array(rows, np.float64).reshape(number, side, side)
+
+
 def _world(value: Any) -> World:
-    rotation, offset = (tuple(_number(v) for v in value[key]) for key in ("rotation", "offset"))
+    value = _object(value)
+    rotation, offset = (tuple(_number(v) for v in _list(value[key])) for key in ("rotation", "offset"))
     return World(rotation, offset, _number(value["scale"]))
 
 
 def _color(value: Any) -> tuple[float, float, float]:
-    red, green, blue = (_number(v) for v in value)
+    red, green, blue = (_number(v) for v in _list(value))
     return red, green, blue
 
 
@@ -222,8 +273,15 @@ def _number(value: Any) -> float:
 
 
 def _whole(value: Any) -> int:
-    if type(value) is not int:
+    # 32.0 is a whole number in JSON.
+    if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value):
         raise TypeError(f"expected a whole number, got {str(value)[:40]!r}")
+    return int(value)
+
+
+def _list(value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        raise TypeError(f"expected an array, got {type(value).__name__}")
     return value
 
 

@@ -1,4 +1,4 @@
-// Bit fields and parts (section 3 of the packet format). Most significant bit first, zero padded to a byte.
+// Bit fields and parts (chapter 2 of docs/spec). Most significant bit first, zero padded to a byte.
 
 import { PacketError } from "./errors.js";
 

@@ -1,4 +1,4 @@
-// The container: file header, packet headers, sections and their checksums (sections 1, 2 and 7 of the packet format).
+// The container: file header, packet headers, sections and their checksums (chapter 1 of docs/spec).
 
 import { PacketError } from "./errors.js";
 import { ATTRIBUTES, FORMAT_MAJOR, FORMAT_MINOR, MAX_BODY, MAX_SECTIONS } from "./limits.js";

@@ -1,4 +1,4 @@
-// The state that a stream of packets leads to, bit for bit the one of the encoder. See docs/reference/packet-format.md.
+// The state that a stream of packets leads to, bit for bit the one of the encoder. See docs/spec.
 
 import { decodeMotions, unionRows, SECTIONS as MOTION } from "./changes/motion.js";
 import { applyResidual, decodeResidual, SECTIONS as RESIDUAL } from "./changes/residual.js";
@@ -43,8 +43,8 @@ function keyState(header, sections, size, offset) {
 }
 
 /** The state of a key packet, or of its first layer, which has no `layout`. */
-export function firstState(frame, number, { scene, layout, meta }) {
-  const widths = { means: 3, quats: 4, scales: 3, opacities: 1, sh0: 3, shN: number ? scene.shN.length / number : 0 };
+export function firstState(frame, number, { scene, layout, meta, rest }) {
+  const widths = { means: 3, quats: 4, scales: 3, opacities: 1, sh0: 3, shN: rest };
   return {
     frame,
     number,

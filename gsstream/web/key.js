@@ -5,14 +5,19 @@ import { decodeAttributes } from "./attributes.js";
 import { viewOf } from "./container.js";
 import { unpackParts } from "./bits.js";
 import { PacketError, located } from "./errors.js";
-import { ATTRIBUTES, FREE_GAUSSIANS, MAX_GAUSSIANS, MAX_GAUSSIANS_PER_BYTE, MAX_META, MAX_UNITS } from "./limits.js";
+import { ATTRIBUTES, FREE_GAUSSIANS, MAX_GAUSSIANS, MAX_GAUSSIANS_PER_BYTE } from "./limits.js";
+import { MAX_META, MAX_UNIT, MAX_UNITS } from "./limits.js";
+import { parseMeta } from "./meta.js";
 import { decodeSymbols, range } from "./symbols.js";
 import { decompress } from "./vendor/fzstd.js";
 
 /** `layers` decodes packets with layers, once who meets one has loaded layers.js. */
 export const later = { layers: null };
 
-/** Decode the sections of a key packet of `size` bytes at `offset`: `{ scene, layout, meta }`. */
+/**
+ * Decode the sections of a key packet of `size` bytes at `offset`: `{ scene, layout, meta, rest }`, where `rest` is how
+ * many values of shN a row has, also where there is no row.
+ */
 export function decodeKey(found, size, offset) {
   const wanted = ["meta", "layout", ...ATTRIBUTES];
   const names = Object.keys(found);
@@ -24,7 +29,7 @@ export function decodeKey(found, size, offset) {
   const layout = located(found.layout.offset, () => decodeLayout(found.layout.data, mostGaussians(size)));
   const decode = layered ? later.layers : decodeAttributes;
   const scene = decode(found, layout.unitOf.length);
-  return { scene, layout, meta };
+  return { scene, layout, meta, rest: found.shN.data[1] };
 }
 
 /** How many Gaussians and nodes a key packet of so many bytes may announce. */
@@ -64,8 +69,8 @@ function decodeLayout(data, most) {
   }
   const unitOf = decodeUnits(unitBytes, number, kinds);
   if (number > 0 && nodes === 0) throw new PacketError(`layout: ${number} Gaussians in no node`);
-  if (!units.every((unit) => Number.isFinite(unit) && unit > 0)) {
-    throw new PacketError("layout: units must be finite and positive");
+  if (!units.every((unit) => unit > 0 && unit < MAX_UNIT)) {
+    throw new PacketError(`layout: units: expected numbers above 0 and below ${MAX_UNIT}`);
   }
   return { counts, unitOf, units };
 }
@@ -82,30 +87,16 @@ export function decodeUnits(data, number, kinds) {
 
 /** Decode the meta section. What a player does not use (the recipe and its hash) is handed on unchecked. */
 export function decodeMeta(data) {
-  let value;
-  try {
-    value = JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(inflate(data, MAX_META)));
-  } catch (error) {
-    if (error instanceof PacketError) throw error;
-    throw new PacketError(`meta: not what was expected: ${error.message}`);
-  }
-  if (value === null || typeof value !== "object") throw new PacketError("meta: expected an object");
-  const rigs = [value.train, value.test];
-  if (!rigs.every(isRig) || !isColour(value.background) || !(Number(value.fps) > 0 && Number.isFinite(value.fps))) {
-    throw new PacketError("meta: expected cameras by split, a background and a positive frame rate");
-  }
-  if ("world" in value && !isWorld(value.world)) {
-    throw new PacketError("meta: world: expected a rotation, an offset and a scale above 0");
-  }
-  return value;
+  return parseMeta(inflate(data, MAX_META));
 }
 
 /** The content of one zstandard frame, whose announced size is checked against `limit` before it is allocated. */
 export function inflate(data, limit) {
-  const size = contentSize(data);
+  const { size, at } = frameHead(data);
   if (size === null || size > limit) {
     throw new PacketError(`compressed part announces ${size} bytes; expected at most ${limit}`);
   }
+  if (frameEnd(data, at) !== data.length) throw new PacketError("compressed part: expected one zstandard frame alone");
   let out;
   try {
     out = decompress(data, new Uint8Array(size));
@@ -116,55 +107,29 @@ export function inflate(data, limit) {
   return out;
 }
 
-function contentSize(data) {
+/** What a zstandard frame says of its content: bytes (null: nothing), and where its blocks begin. */
+function frameHead(data) {
   if (data.length < 6 || data[0] !== 0x28 || data[1] !== 0xb5 || data[2] !== 0x2f || data[3] !== 0xfd) {
     throw new PacketError("not a zstandard frame");
   }
   const flags = data[4];
   const single = (flags >> 5) & 1;
   const kind = flags >> 6;
-  if (kind === 0 && !single) return null;
-  const bytes = kind === 0 ? 1 : 1 << kind;
-  const at = 6 - single + [0, 1, 2, 4][flags & 3];
-  if (at + bytes > data.length) throw new PacketError("zstandard frame cut short");
+  const from = 6 - single + [0, 1, 2, 4][flags & 3];
+  const bytes = kind === 0 ? single : 1 << kind;
+  if (from + bytes > data.length) throw new PacketError("zstandard frame cut short");
+  if (data.subarray(6 - single, from).some((byte) => byte)) throw new PacketError("zstandard frame with a dictionary");
   let size = 0;
-  for (let i = bytes - 1; i >= 0; i -= 1) size = size * 256 + data[at + i];
-  return kind === 1 ? size + 256 : size;
+  for (let i = bytes - 1; i >= 0; i -= 1) size = size * 256 + data[from + i];
+  return { size: bytes ? size + 256 * (kind === 1) : null, at: from + bytes };
 }
 
-const isNumbers = (list, length) =>
-  Array.isArray(list) && list.length === length && list.every((v) => typeof v === "number" && Number.isFinite(v));
-
-function isColour(value) {
-  return isNumbers(value, 3);
-}
-
-function isRig(rig) {
-  if (rig === null || typeof rig !== "object" || !Array.isArray(rig.ids)) return false;
-  const number = rig.ids.length;
-  return (
-    rig.ids.every((id) => typeof id === "string") &&
-    [rig.width, rig.height].every((side) => Number.isInteger(side) && side >= 0 && side <= 1 << 16) &&
-    Number.isFinite(rig.near) &&
-    rig.near > 0 &&
-    Array.isArray(rig.viewmats) &&
-    rig.viewmats.length === number &&
-    rig.viewmats.every((m) => isNumbers(m, 16)) &&
-    Array.isArray(rig.Ks) &&
-    rig.Ks.length === number &&
-    rig.Ks.every((K) => isNumbers(K, 9))
-  );
-}
-
-/** Whether a value is a similarity: a rotation row by row, an offset and a scale above 0, all of them finite. */
-export function isWorld(value) {
-  if (value === null || typeof value !== "object") return false;
-  const { rotation, offset, scale } = value;
-  const numbers = [rotation, offset].every((list) => Array.isArray(list) && list.every(Number.isFinite));
-  if (!numbers || rotation.length !== 9 || offset.length !== 3 || !(Number.isFinite(scale) && scale > 0)) return false;
-  const rows = [0, 3, 6].map((at) => rotation.slice(at, at + 3));
-  const across = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-  const square = rows.every((a, i) => rows.every((b, k) => Math.abs(across(a, b) - (i === k)) <= 1e-6));
-  const [[a, b, c], [d, e, f], [g, h, i]] = rows;
-  return square && a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0;
+/** The byte behind a zstandard frame whose blocks begin at byte `at`, by the lengths of its blocks. */
+function frameEnd(data, at) {
+  for (let last = 0; !last && at + 3 <= data.length; ) {
+    const head = data[at] | (data[at + 1] << 8) | (data[at + 2] << 16);
+    last = head & 1;
+    at += 3 + ((head >> 1) % 4 === 1 ? 1 : head >> 3);
+  }
+  return at + (data[4] & 4);
 }

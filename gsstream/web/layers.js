@@ -88,5 +88,5 @@ function soundLayer(data) {
   const found = splitSections(7, body, START);
   if (`${Object.keys(found)}` !== `meta,${ATTRIBUTES}`) return null;
   const scene = decodeAttributes(found, count);
-  return firstState(frame, count, { scene, layout: null, meta: decodeMeta(found.meta.data) });
+  return firstState(frame, count, { scene, layout: null, meta: decodeMeta(found.meta.data), rest: found.shN.data[1] });
 }

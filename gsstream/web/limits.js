@@ -1,4 +1,4 @@
-// Limits of section 8 of the packet format: what a reader checks before it allocates.
+// Limits of section 1.8 of docs/spec: what a reader checks before it allocates.
 
 export const FORMAT_MAJOR = 2;
 export const FORMAT_MINOR = 3;
@@ -7,8 +7,9 @@ export const FREE_GAUSSIANS = 1 << 16;
 export const MAX_GAUSSIANS_PER_BYTE = 64;
 export const MAX_BODY = 2 ** 30;
 export const MAX_SECTIONS = 16;
-export const MAX_META = 16 << 20;
+export const MAX_META = 1 << 20;
 export const MAX_UNITS = 64;
+export const MAX_UNIT = 1e9;
 export const MAX_CHANNELS = 64;
 export const MAX_BINS = 1 << 14;
 export const MAX_CODE = 1 << 20;

@@ -95,7 +95,7 @@ export function range(values) {
   return [low, high];
 }
 
-// The entropy decoder: the stack coder of constriction 0.5 (64-bit state, 32-bit words) with 24-bit categorical models.
+// The entropy decoder: 64-bit state, 32-bit words, 24-bit models (sections 2.5 and 2.6 of docs/spec).
 //
 // The state is kept as two halves of 32 bits, and multiplied in pieces of 12 and 16: all of it is arithmetic of 32-bit
 // integers, exact without BigInt.
@@ -106,7 +106,7 @@ const GUIDE_BITS = 10;
 const GUIDE_SHIFT = PRECISION - GUIDE_BITS;
 
 /**
- * Left ends of the intervals of every symbol in units of 2^-24, and 2^24 last: `Categorical(counts, perfect=False)`.
+ * Left ends of the intervals of every symbol in units of 2^-24, and 2^24 last.
  *
  * Every symbol first gets one unit; the rest is shared by the counts, cut off towards zero, in float64.
  */

@@ -2,7 +2,7 @@
 
 The list of kinds is short and closed, so that every player can play every stream: encoder and player call the same
 functions, and a stream never needs a plugin. The arithmetic is +, -, x, / and square root in a stated order and
-precision, so that another implementation can agree bit by bit (docs/reference/packet-format.md).
+precision, so that another implementation can agree bit by bit (docs/spec).
 """
 
 from gsstream.core.changes.delta import Change as Change

@@ -1,4 +1,4 @@
-// Motion: groups of rows move rigidly, as predicted from the last frame and corrected (section 5.1 of the format).
+// Motion: groups of rows move rigidly, as predicted from the last frame and corrected (section 4.4 of docs/spec).
 
 import { unpackParts } from "../bits.js";
 import { PacketError } from "../errors.js";
@@ -89,10 +89,10 @@ function decodeMotion(data, scene) {
   if (levels !== 1) throw new PacketError("motion: groups move or stand still, there are no levels");
   const number = moving.reduce((sum, gate) => sum + gate, 0);
   const symbols = decodeSymbols(table, number, 6);
-  let largest = 0;
-  for (let i = 0; i < symbols.length; i += 1) largest = Math.max(largest, Math.abs(symbols[i]));
-  const step = Math.max(translationStep, rotationStep);
-  if (largest * step > MAX_TRANSLATION) throw new PacketError("motion: a correction that cannot be");
+  for (let i = 0; i < symbols.length; i += 1) {
+    const step = i < 3 * number ? translationStep : rotationStep;
+    if (Math.abs(symbols[i]) * step > MAX_TRANSLATION) throw new PacketError("motion: a correction that cannot be");
+  }
   return { groups, moving, number, symbols, translationStep, rotationStep, predicted: (flags & PREDICTED) !== 0 };
 }
 

@@ -21,9 +21,9 @@ from gsstream.packet.symbols import encode_symbols
 MANY = 0xFFFFFFFF
 METAS = {
     b"": "Expecting value",
-    b"[]": "list indices",
+    b"[]": "expected an object, got list",
     b"{}": "the entry 'method' is missing",
-    b"[" * 100_000: "recursion",
+    b"[" * 100_000: "more than 100 deep",
     b'{"version": NaN}': "NaN is not a number",
     b"\xff\xfe": "not what was expected",
     b"1" * 5000: "Exceeds the limit",
@@ -84,6 +84,7 @@ def no_cameras(meta: dict[str, Any]) -> None:
         meta[split] |= {"ids": [], "viewmats": [], "Ks": []}
 
 
+SINGLE, ABOVE = "expected finite numbers in float32", "expected finite numbers above 0 in float32"
 WORLD = {"rotation": [0, 1, 0, -1, 0, 0, 0, 0, 1], "offset": [5e5, 5.2e6, 300], "scale": 2.5}
 RANGE, NUMBER = "fps: expected 0.01 to 100000 frames per second, got", "expected a number, got"
 WHOLE, SIDE, TEXT = "expected a whole number, got", "expected 1 to 65536 pixels a side", "expected text, got"
@@ -110,7 +111,19 @@ LIES: list[tuple[str, str, Callable[[Any], Changed], tuple[Any, ...]]] = [
     ("world at", NUMBER, lambda at: put(world={**WORLD, "offset": at}), ([1, 2, None],)),
     ("rotation", SKEW, lambda by: put(world={**WORLD, "rotation": by}), ([1] * 9, [-1, 0, 0, 0, 1, 0, 0, 0, 1])),
     ("rotation", NUMBER, lambda by: put(world={**WORLD, "rotation": by}), ([[1, 0, 0], [0, 1, 0], [0, 0, 1]],)),
-    ("world", "list indices", lambda world: put(world=world), ([1],)),
+    ("world", "expected an object, got list", lambda world: put(world=world), ([1],)),
+    # As the browser's player reads them, and no other way: what numpy would take for numbers is none.
+    ("ids", "expected an array, got str", lambda ids: in_rig(ids=ids), ("ab",)),
+    ("viewmats", "expected an array, got", lambda viewmats: in_rig(viewmats=viewmats), ("0" * 32, ["0" * 16] * 2)),
+    ("viewmats", NUMBER, lambda viewmats: in_rig(viewmats=viewmats), ([[True] * 16] * 2, [np.eye(4).tolist()] * 2)),
+    ("Ks", "expected 2 matrices of 9 numbers", lambda Ks: in_rig(Ks=Ks), ([[1] * 9], [[1] * 8] * 2, [])),
+    ("train", "expected an object, got list", lambda train: put(train=train), ([],)),
+    # Finite in float64, and not in the float32 of renderers.
+    ("background", SINGLE, lambda colour: put(background=colour), ([1e39, 0, 0], [0, -1e300, 0])),
+    ("near", ABOVE, lambda near: in_rig(near=near), (1e-300, 1e39)),
+    ("focal length", ABOVE, lambda f: in_rig(Ks=[[f, 0, 1, 0, 3e38, 1, 0, 0, 1]] * 2), (1e-46,)),
+    ("focal length", SINGLE, lambda f: in_rig(Ks=[[f, 0, 1, 0, 1, 1, 0, 0, 1]] * 2), (1e39,)),
+    ("viewmats", SINGLE, lambda x: in_rig(viewmats=[[1, 0, 0, x, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]] * 2), (1e39,)),
     ("world", "the entry 'scale' is missing", lambda turn: put(world={"rotation": turn, "offset": [0] * 3}), ([0],)),
     ("origin", NOT_3, lambda origin: extra(origin=origin), ([0, 0], 3, [0, 0, 1e39])),
     ("origin", "expected numbers in the shape [3]: ", lambda origin: extra(origin=origin), ("abc", [[0], 1, 2])),

@@ -1,4 +1,4 @@
-"""A second decoder of fields, written from docs/reference/packet-format.md, section 5.2, row by row in plain Python.
+"""A second decoder of fields, written from docs/spec, section 4.5, row by row in plain Python.
 
 Whole numbers are Python's, which never round; everything else is one float operation at a time.
 """

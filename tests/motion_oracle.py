@@ -1,4 +1,4 @@
-"""Section 5.1 of docs/reference/packet-format.md in plain Python, written from its text alone: an oracle for motions.
+"""Section 4.4 of docs/spec in plain Python, written from its text alone: an oracle for motions.
 
 Numbers are Python floats (float64), rows are lists, and float32 is what ``struct`` makes of a number. It shares no code
 with gsstream.core.changes: where the two differ in a bit, the text or one of them is wrong.

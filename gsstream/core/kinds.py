@@ -1,9 +1,9 @@
 """The kinds of parts, in one table. Every list of kinds, slots or contracts is derived from it.
 
-A new kind is one entry here, a room with its contract class, and a room of its name in ``gsstream.testing``:
-``checks``, an ``example`` that new plugins start from (``use``), and ``behaviour``, what the common checks need to know
-of it. A kind that is a slot also gets a field of its name in ``recipe.model.Recipe`` and
-``engine.assembly.assemble.Assembly``.
+A new kind is one entry here, a room with its contract class, a module of its name in ``gsstream.testing`` with the
+checks of the kind and a ``BEHAVIOUR`` for the common checks, and a module of its name in ``gsstream.testing.examples``
+with the part that new plugins start from (``use``). A kind that is a slot also gets a field of its name in
+``recipe.model.Recipe`` and ``engine.assembly.assemble.Assembly``.
 """
 
 from __future__ import annotations

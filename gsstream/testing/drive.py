@@ -32,7 +32,7 @@ class Poison:
 
 @dataclass(frozen=True)
 class Behaviour:
-    """How the common checks treat a kind; each kind with ``PartKind.behaviour`` has one in its room."""
+    """How the common checks treat a kind; the module of each kind with ``PartKind.behaviour`` has one."""
 
     outputs: Callable[[Any, World], Outputs]  # every output of every method on a world, tensor by tensor
     poisons: tuple[Poison, ...]  # what a part may read, one value of each
@@ -45,7 +45,7 @@ class Behaviour:
 
 def behaviour_of(part: Part) -> Behaviour:
     """Return the behaviour of the part's kind."""
-    found: Behaviour = importlib.import_module(f"gsstream.testing.{kind_of(part)}.checks").BEHAVIOUR
+    found: Behaviour = importlib.import_module(f"gsstream.testing.{kind_of(part)}").BEHAVIOUR
     return found
 
 

@@ -14,17 +14,18 @@ from gsstream.core.part import Part
 from gsstream.method.base import StreamingMethod
 from gsstream.spec import CommandSpec
 from gsstream.testing import method_driver
-from gsstream.testing.command.checks import CommandUnderTest
-from gsstream.testing.packet.checks import PacketCodec
+from gsstream.testing.command import CommandUnderTest
+from gsstream.testing.packet import PacketCodec
 from gsstream.testing.recording import SourceUnderTest
 from gsstream.testing.registry import CHECKS, MIN_REASON, Advice, Check, Skip, checks_for, expected_failure_of, kind_of
 
 Status = Literal["passed", "failed", "warning", "expected failure", "skipped"]
-#: Rooms of checks: for parts of all kinds, for each kind, for packets. Importing them fills the registry, in the order
-#: of the reports.
-ROOMS = ("common", *PART_KINDS, "packet", "command")
-for _room in ROOMS:
-    importlib.import_module(f"gsstream.testing.{_room}.checks")
+#: Modules of checks: for parts of all kinds, for each kind, for packets, for commands. Importing them fills the
+#: registry, in the order of the reports. In a folder the checks are its module ``checks``.
+MODULES = ("common", *PART_KINDS, "packet", "command")
+for _name in MODULES:
+    if hasattr(importlib.import_module(f"gsstream.testing.{_name}"), "__path__"):
+        importlib.import_module(f"gsstream.testing.{_name}.checks")
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,16 +17,16 @@ from gsstream.parts.gate.always_open import AlwaysOpen
 from gsstream.parts.gate.base import GateSampler
 from gsstream.parts.structure.flat import Flat
 from gsstream.testing import SourceUnderTest, parametrize_with_checks, run_checks
-from gsstream.testing.confidence.example import ExampleConfidence
-from gsstream.testing.gate.example import ExampleGate
+from gsstream.testing.examples.confidence import ExampleConfidence
+from gsstream.testing.examples.gate import ExampleGate
+from gsstream.testing.examples.propagation import ExamplePropagation
+from gsstream.testing.examples.regularizer import ExampleRegularizer
+from gsstream.testing.examples.streaming_method import ExampleMethod
+from gsstream.testing.examples.structure import ExampleStructure
+from gsstream.testing.examples.update import ExampleUpdate
 from gsstream.testing.kit import all_checks, summary
 from gsstream.testing.loss.example import ExampleLoss
-from gsstream.testing.propagation.example import ExamplePropagation
-from gsstream.testing.regularizer.example import ExampleRegularizer
 from gsstream.testing.source.example import ExampleSource
-from gsstream.testing.streaming_method.example import ExampleMethod
-from gsstream.testing.structure.example import ExampleStructure
-from gsstream.testing.update.example import ExampleUpdate
 
 EXAMPLES = [ExampleStructure(), ExampleConfidence(), ExamplePropagation(), ExampleGate(), ExampleRegularizer()]
 EXAMPLES += [ExampleMethod(), ExampleUpdate(), ExampleLoss()]

@@ -77,7 +77,7 @@ assert torch
 
 @hookimpl
 def gsstream_components():
-    target = "gsstream.testing.gate.example:ExampleGate"
+    target = "gsstream.testing.examples.gate:ExampleGate"
     return [ComponentSpec(kind="gate", name="heavy", target=target, summary="declared by a module that imports torch")]
 """
 
@@ -85,7 +85,7 @@ def gsstream_components():
 def test_a_plugin_whose_declaration_imports_torch_fails_exactly_that(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from gsstream.testing.gate.example import ExampleGate
+    from gsstream.testing.examples.gate import ExampleGate
 
     (tmp_path / "gsstream_heavy_plugin.py").write_text(HEAVY)
     write_metadata(tmp_path, "gsstream-heavy", "0.1", "[gsstream]\nheavy = gsstream_heavy_plugin\n")

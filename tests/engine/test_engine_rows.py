@@ -16,7 +16,7 @@ from gsstream.parts.motion.none import Still
 from gsstream.parts.optimiser.adam import ReferenceAdam
 from gsstream.parts.optimiser.row_parameters import RowParameters, TopologyEdit
 from gsstream.recipe.model import Stream
-from gsstream.testing.packet.checks import tiny_key
+from gsstream.testing.packet import tiny_key
 from tests.scenes import make_scene
 
 

@@ -29,9 +29,9 @@ from gsstream.parts.render.wrt import WrtRows
 from gsstream.player.playback import Playback
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe
+from gsstream.testing.examples.streaming_method import ExampleMethod
 from gsstream.testing.method_driver import SOURCE, MethodUnderTest
-from gsstream.testing.streaming_method.checks import check_method_closed_loop, check_method_resume
-from gsstream.testing.streaming_method.example import ExampleMethod
+from gsstream.testing.streaming_method import check_method_closed_loop, check_method_resume
 
 Follow: Any = ExampleMethod  # final: only what is wrong on purpose may inherit from it
 

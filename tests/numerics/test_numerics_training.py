@@ -26,7 +26,7 @@ from gsstream.input.recordings.open import open_source
 from gsstream.metrics import psnr
 from gsstream.parts.optimiser.adam import ReferenceAdam
 from gsstream.parts.optimiser.base import MAX_GRADIENT, AdamState, RowOptimiser
-from gsstream.testing.streaming_method.checks import SOURCE, MethodUnderTest
+from gsstream.testing.streaming_method import SOURCE, MethodUnderTest
 
 
 @functools.cache

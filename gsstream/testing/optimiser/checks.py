@@ -17,9 +17,9 @@ from gsstream.parts.update.base import AttributeCode
 from gsstream.parts.update.joint import joint_layout
 from gsstream.testing.cases import BLACK, RENDERER, get_case
 from gsstream.testing.compare import equal
-from gsstream.testing.gate.example import ExampleGate
+from gsstream.testing.examples.gate import ExampleGate
+from gsstream.testing.examples.regularizer import ExampleRegularizer
 from gsstream.testing.registry import check
-from gsstream.testing.regularizer.example import ExampleRegularizer
 
 STEPS = 12
 WHY = "float32 over a dozen steps"

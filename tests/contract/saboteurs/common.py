@@ -7,9 +7,9 @@ from typing import Any
 
 import torch
 
-from gsstream.testing.confidence.example import ExampleConfidence
-from gsstream.testing.gate.example import ExampleGate
-from gsstream.testing.propagation.example import ExamplePropagation
+from gsstream.testing.examples.confidence import ExampleConfidence
+from gsstream.testing.examples.gate import ExampleGate
+from gsstream.testing.examples.propagation import ExamplePropagation
 from saboteurs.register import spoils
 
 # The examples are final; only a saboteur may inherit from them, and only behind the type checker's back.

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from gsstream.testing.confidence.example import ExampleConfidence
+from gsstream.testing.examples.confidence import ExampleConfidence
 from saboteurs.register import spoils
 
 Confidence: Any = ExampleConfidence

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from gsstream.parts.gate.base import AnalyticGate
-from gsstream.testing.gate.example import ExampleGate
+from gsstream.testing.examples.gate import ExampleGate
 from saboteurs.register import spoils
 
 Gate: Any = ExampleGate

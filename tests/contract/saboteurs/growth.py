@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gsstream.core.changes import RowEdit, add_to_nodes
-from gsstream.testing.growth.example import ExampleGrowth
+from gsstream.testing.examples.growth import ExampleGrowth
 from gsstream.testing.working import INDEX
 from saboteurs.register import spoils
 

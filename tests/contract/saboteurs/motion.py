@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gsstream.core.changes import Motion
-from gsstream.testing.motion.example import ExampleMotion
+from gsstream.testing.examples.motion import ExampleMotion
 from gsstream.testing.working import INDEX
 from saboteurs.register import spoils
 

@@ -14,8 +14,8 @@ from gsstream.parts.optimiser.adam import ReferenceAdam
 from gsstream.parts.optimiser.joint import JointResidualOptimiser
 from gsstream.parts.optimiser.residual import ResidualEpoch, ResidualOptimiser
 from gsstream.parts.update.base import AttributeCode
+from gsstream.testing.examples.update import ExampleUpdate
 from gsstream.testing.loss.example import ExampleLoss
-from gsstream.testing.update.example import ExampleUpdate
 from saboteurs.register import spoils
 
 # They are final; only a saboteur may inherit from them, and only behind the type checker's back.

@@ -12,7 +12,7 @@ from gsstream.core.changes import sent_rows
 from gsstream.core.errors import PacketError
 from gsstream.packet import EncodedPacket, PlayerState, decode_packet, encode_delta
 from gsstream.packet.base import parse_header
-from gsstream.testing.packet.checks import PacketCodec
+from gsstream.testing.packet import PacketCodec
 
 Decode = Callable[[PlayerState | None, bytes], PlayerState]
 

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from gsstream.core.hierarchy import Hierarchy, tree_roots
-from gsstream.testing.propagation.example import ExamplePropagation
+from gsstream.testing.examples.propagation import ExamplePropagation
 from saboteurs.register import spoils
 
 Propagation: Any = ExamplePropagation

@@ -8,7 +8,7 @@ import torch
 
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.parts.regularizer.base import AnalyticPenalty
-from gsstream.testing.regularizer.example import ExampleRegularizer
+from gsstream.testing.examples.regularizer import ExampleRegularizer
 from saboteurs.register import spoils
 
 Regularizer: Any = ExampleRegularizer

@@ -9,7 +9,7 @@ import torch
 
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.parts.structure.base import Anchors
-from gsstream.testing.structure.example import ExampleStructure
+from gsstream.testing.examples.structure import ExampleStructure
 from saboteurs.register import spoils
 
 Structure: Any = ExampleStructure

@@ -22,8 +22,8 @@ from gsstream.core.errors import InputError
 from gsstream.core.kinds import CONTRACTS
 from gsstream.core.part import Part
 from gsstream.parts.gate.base import GateSampler
+from gsstream.testing import device as device
 from gsstream.testing.cases import EXTREMES, World, fingerprint, get_case
-from gsstream.testing.common import device as device
 from gsstream.testing.compare import ROUNDING, all_equal, finite
 from gsstream.testing.drive import Poison, behaviour_of, draw, outputs
 from gsstream.testing.recording import SourceUnderTest

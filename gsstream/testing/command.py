@@ -8,7 +8,7 @@ from typing import Any
 from gsstream.discovery.catalog import Catalog, Entry
 from gsstream.discovery.commands import command_of
 from gsstream.spec import CommandSpec
-from gsstream.testing.common.checks import imports_torch
+from gsstream.testing.common import imports_torch
 from gsstream.testing.registry import check
 
 

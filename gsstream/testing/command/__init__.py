@@ -1,1 +1,0 @@
-"""Checks of commands that plugins add to ``gsstream``."""

@@ -1,1 +1,0 @@
-"""What every gate sampler promises."""

@@ -1,1 +1,0 @@
-"""What every method promises, whatever steps it from frame to frame."""

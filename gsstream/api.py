@@ -81,6 +81,7 @@ from gsstream.parts.growth.base import Growth as Growth
 from gsstream.parts.loss.base import Loss as Loss
 from gsstream.parts.loss.base import LossTraits as LossTraits
 from gsstream.parts.motion.base import MotionPart as MotionPart
+from gsstream.parts.motion.base import MotionTraits as MotionTraits
 from gsstream.parts.optimiser.base import ADAM_BETAS as ADAM_BETAS
 from gsstream.parts.optimiser.base import ADAM_EPS as ADAM_EPS
 from gsstream.parts.optimiser.base import AdamState as AdamState

@@ -158,6 +158,12 @@ CLAIMS: dict[str, dict[str, Any]] = {
     "gate/gumbel-sigmoid": {"stochastic": True, "differentiable": True, "temperature": True},
     "loss/cpu": {"takes_bytes": True},
     "loss/reference": {},
+    "motion/hicom": {"finds_motion": True, "momentum": 0.6},
+    "motion/keypoints": {"finds_motion": True, "momentum": 0.0},
+    "motion/recon": {"finds_motion": True, "momentum": 0.6},
+    "motion/rigid": {"finds_motion": True, "momentum": 1.0},
+    "motion/still": {"momentum": 0.0},
+    "motion/stream3dgs": {},
     "propagation/ft-pruning": {"idempotent": True, "differentiable": True, "parent_bound": True},
     "propagation/group-max": {"conservative": True, "idempotent": True, "differentiable": True, "normalised": True},
     "propagation/hierarchical-max": {

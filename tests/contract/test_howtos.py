@@ -50,7 +50,9 @@ def test_the_example_passes_every_check_of_its_kind(kind: str, monkeypatch: pyte
     results = run_checks(part)
     assert [f"{result.check}: {result.message}" for result in results if not result.ok] == []
     skipped = {result.check for result in results if result.status == "skipped"}
-    assert skipped == {"check_cheap_spec"}, "the example claims all that can be claimed"
+    # The page's motion corrects nothing, so it finds no body that moves in another way than before.
+    unclaimed = {"motion": {"check_motion_finds_bodies"}}.get(kind, set())
+    assert skipped == {"check_cheap_spec"} | unclaimed, "the example claims all that can be claimed"
     assert len(results) > (15 if kind in BEHAVED else 2)
 
 

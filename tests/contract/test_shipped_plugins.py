@@ -34,7 +34,7 @@ def test_everything_shipped_keeps_the_contract(distribution: str, capsys: pytest
 
 
 COPIES = {"epochs": 1, "gradient": 1e-6, "rounds": 1, "most": 9}
-ANCHORS = {"epochs": 1, "measure": "anchor", "step": 0.02, "rotation_step": 0.002}
+ANCHORS = {"measure": "anchor", "step": 0.02, "rotation_step": 0.002}
 CACHE = {"epochs": 1, "levels": 4, "entries": 8, "width": 8, "lr": 0.02, "box": 0.0}
 #: Whole method -> settings under which something moves, and is born, in three frames of one or two passes.
 EAGER: dict[str, list[dict[str, Any]]] = {
@@ -53,8 +53,8 @@ EAGER: dict[str, list[dict[str, Any]]] = {
 OTHERWISE: dict[tuple[str, str], list[dict[str, Any]]] = {
     ("gate", "binary-ste"): [{"noise": "none"}, {"temperature": 2.0}, {"clamp_gradient": True}],
     ("motion", "keypoints"): [{"epochs": 1, "keypoints": 20, "step": 0.02}],
-    ("motion", "hicom"): [{"epochs": 1, "measure": "cell", "step": 0.02}],
-    ("motion", "recon"): [ANCHORS, {**ANCHORS, "rounded": True}],
+    ("motion", "hicom"): [{"epochs": 1, "measure": "cell", "step": 0.02}, {"momentum": 0.0}],
+    ("motion", "recon"): [ANCHORS, {**ANCHORS, "rounded": True}, {"every": 1}, {"momentum": 0.0}],
     ("motion", "stream3dgs"): [CACHE, {**CACHE, "sent": "cells"}],
     ("growth", "copies"): [COPIES, {**COPIES, "leave": "last-added"}],
     ("growth", "change-gated-copies"): [{**COPIES, "score": 0.1}],

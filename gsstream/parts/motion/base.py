@@ -3,12 +3,27 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 from gsstream.core.changes import Delta, Field, Layout, Motion, Scene
-from gsstream.core.part import Part
+from gsstream.core.part import Part, Traits
 from gsstream.core.rng import Rng
 from gsstream.parts.render.work import FitContext
+
+
+@dataclass(frozen=True, slots=True)
+class MotionTraits(Traits):
+    """What a motion part claims.
+
+    Arguments:
+        finds_motion: fits motions to the images: two bodies that move by a pixel or two, each its own way, are found.
+        momentum: share of its last displacement by which a body moves where the images say nothing about the body;
+            0: the body stays; None: nothing is promised.
+    """
+
+    finds_motion: bool = False
+    momentum: float | None = None
 
 
 class MotionPart(Part):
@@ -19,6 +34,11 @@ class MotionPart(Part):
     groups move and what corrects the prediction; it never moves Gaussians itself. The residual of the frame is learned
     on the moved scene.
     """
+
+    traits: ClassVar[MotionTraits] = MotionTraits()
+
+    def claims(self) -> MotionTraits:
+        return self.traits
 
     @abstractmethod
     def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion | Field, ...]:

@@ -13,7 +13,7 @@ from gsstream.core.part import PartConfig
 from gsstream.core.picture_size import enlargement
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
-from gsstream.parts.motion.base import MotionPart
+from gsstream.parts.motion.base import MotionPart, MotionTraits
 from gsstream.parts.motion.groups import changed_groups, known_groups
 from gsstream.parts.motion.newton import BodySettings, Damping, fit_transforms_newton
 from gsstream.parts.render.work import FitContext
@@ -72,6 +72,7 @@ class Rigid(MotionPart):
         least: float = Field(default=0.25, ge=0, le=10, description="motions below this many pixels are dropped")
 
     source: ClassVar[str] = "gsstream; groups of one rigid motion as in HiCoM"
+    traits: ClassVar[MotionTraits] = MotionTraits(finds_motion=True, momentum=1.0)
 
     def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion, ...]:
         config = self.config

@@ -7,7 +7,7 @@ from typing import Any, final
 import numpy as np
 from pydantic import Field
 
-from gsstream.api import FitContext, Motion, MotionPart, PartConfig, Rng, Scene, groups_for
+from gsstream.api import FitContext, Motion, MotionPart, MotionTraits, PartConfig, Rng, Scene, groups_for
 
 
 @final
@@ -18,6 +18,7 @@ class ExampleMotion(MotionPart):
     """
 
     source = "gsstream"
+    traits = MotionTraits(momentum=1.0)
 
     class Config(PartConfig):
         cell: float = Field(default=0.03, gt=0, le=1, description="side of a group, fraction of the rig's extent")

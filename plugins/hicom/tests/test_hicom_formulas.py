@@ -9,7 +9,7 @@ import pytest
 import torch
 from gsstream_hicom.motion import CoherentMotion, cell_sides
 
-from gsstream.api import Displacement, Rng, Scene, apply_motion
+from gsstream.api import Rng, Scene, apply_motion
 from gsstream.blocks import high_gradient_rows
 from tests.scenes import RIG, SquaredDistances, scene_at
 
@@ -34,40 +34,6 @@ def test_the_finest_cells_hold_as_many_as_asked_for_and_each_grid_is_twice_as_wi
     assert sides == pytest.approx([4 * sides[2], 2 * sides[2], sides[2]])
     # 90 % along each axis lie in the box whose volume is shared by all.
     assert 20_000 * sides[2] ** 3 / 0.9**3 == pytest.approx(5, rel=0.02)
-
-
-@pytest.mark.parametrize("levels", [1, 3])
-def test_two_bodies_find_their_own_ways(levels: int) -> None:
-    """Two clouds far apart move differently; a coarse cell holds both, and finer ones tell them apart."""
-    one, two = cloud(40, (0, 0, 3)), cloud(40, (0.5, 0, 3))
-    means = np.concatenate([one, two])
-    aims = means + np.repeat([[0.03, 0, 0.01], [-0.02, 0.04, 0]], 40, 0)
-    scene = scene_at(means)
-    work = SquaredDistances(scene, aims)
-    there = after(scene, work, levels=levels, lr=0.1, step=0.01, epochs=60)
-    assert np.abs(there.gaussians.means - aims).mean() < 0.3 * np.abs(means - aims).mean()
-
-
-def test_a_frame_begins_with_a_share_of_the_last_ones_motion() -> None:
-    means = cloud(60, (0, 0, 3), 0.05)
-    shift = np.tile(np.float32([0.05, 0, 0]), (60, 1))
-    moved = Displacement(np.arange(60), shift, np.zeros_like(shift))
-    scene = scene_at(means, moved)
-    work = SquaredDistances(scene, means + 0.6 * shift)
-    slow = {"lr": 1e-6, "step": 0.01, "epochs": 3}
-    there = after(scene, work, momentum=0.6, **slow)
-    np.testing.assert_allclose(there.gaussians.means, means + 0.6 * shift, atol=1e-3)
-    still = after(scene, work, momentum=0.0, **slow)
-    np.testing.assert_array_equal(still.gaussians.means, scene.gaussians.means)
-
-
-def test_only_cells_in_what_changed_move() -> None:
-    means = np.concatenate([cloud(30, (0, 0, 3)), cloud(30, (1, 0, 3))])
-    scene = scene_at(means)
-    work = SquaredDistances(scene, means + np.array([0.05, 0, 0]), changed=np.arange(30))
-    there = after(scene, work, epochs=9)
-    assert (there.gaussians.means[:30] != scene.gaussians.means[:30]).any(1).mean() > 0.5
-    np.testing.assert_array_equal(there.gaussians.means[30:], scene.gaussians.means[30:])
 
 
 class Shown:

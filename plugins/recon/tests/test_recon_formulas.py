@@ -76,39 +76,6 @@ def test_levels_say_the_past_together_and_new_anchors_inherit_it() -> None:
     np.testing.assert_allclose(inherited(past, old, new, 9)[1], drawn, err_msg="there are no more than two")
 
 
-def test_bodies_find_their_own_ways_and_what_is_sent_is_what_was_fitted() -> None:
-    """Two clouds far apart move differently; the coarsest anchor holds both, and finer ones tell them apart."""
-    means = np.concatenate([RNG.normal((0, 0, 3), 0.02, (40, 3)), RNG.normal((0.5, 0, 3), 0.02, (40, 3))])
-    aims = means + np.repeat([[0.03, 0, 0.01], [-0.02, 0.04, 0]], 40, 0)
-    settings = ANCHOR.model_copy(update={"lr": 0.1})
-    _, after = fitted(scene_at(means), aims, np.arange(80), settings, 60)
-    assert np.abs(after.gaussians.means - aims).mean() < 0.3 * np.abs(means - aims).mean()
-
-
-def test_only_cells_in_what_changed_move() -> None:
-    means = np.concatenate([RNG.normal((0, 0, 3), 0.02, (30, 3)), RNG.normal((1, 0, 3), 0.02, (30, 3))])
-    scene = scene_at(means)
-    _, after = fitted(scene, means + np.array([0.05, 0, 0]), np.arange(30), ANCHOR)
-    assert (after.gaussians.means[:30] != scene.gaussians.means[:30]).any(1).mean() > 0.5
-    np.testing.assert_array_equal(after.gaussians.means[30:], scene.gaussians.means[30:])
-    _, still = fitted(scene, means + 1, np.zeros(0, np.int64), ANCHOR)
-    assert still is scene
-
-
-@pytest.mark.parametrize("every", [1, 5])
-def test_a_frame_begins_with_a_share_of_the_last_ones_motion(every: int) -> None:
-    """Whether anchors are drawn anew or not; a body that moves as one leaves nothing to lose between them."""
-    means = RNG.normal((0, 0, 3), 0.05, (60, 3))
-    shift = np.tile(np.float32([0.05, 0, 0]), (60, 1))
-    scene = scene_at(means, Displacement(np.arange(60), shift, np.zeros_like(shift)))
-    settings = ANCHOR.model_copy(update={"lr": 1e-6, "every": every})
-    before = due(None, 0, 60, settings, Rng(0))
-    _, after = fitted(scene, means, np.arange(60), settings, 1, before=before)
-    np.testing.assert_allclose(after.gaussians.means, means + 0.6 * shift, atol=1e-3)
-    _, rest = fitted(scene, means, np.arange(60), settings.model_copy(update={"momentum": 0.0}), 1, before=before)
-    assert rest is scene
-
-
 def test_the_weight_of_motion_keeps_what_the_images_say_nothing_about() -> None:
     """Where the images hold the Gaussians moved, as far as momentum moves them, only the weight takes them back."""
     means = RNG.normal((0, 0, 3), 0.05, (60, 3))

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 from gsstream.core.changes import Motion
+from gsstream.parts.motion.base import MotionTraits
+from gsstream.testing import bodies
 from gsstream.testing.examples.motion import ExampleMotion
 from gsstream.testing.working import INDEX
 from saboteurs.register import spoils
@@ -72,3 +74,29 @@ class Own(Base):
     def follow(self, memory: Any, frame: int, before: Any, delta: Any, rng: Any) -> Any:
         CALLS["own"] += 1
         return np.array([CALLS["own"]])
+
+
+@spoils("check_motion_leaves_unchanged")
+class Sweeping(Base):
+    """Moves everything as soon as anything changes."""
+
+    traits = MotionTraits()
+
+    def propose(self, scene: Any, work: Any, rng: Any, memory: Any = None) -> Any:
+        if work.index != bodies.INDEX or not bool(work.changed_rows(0.0).any()):
+            return super().propose(scene, work, rng, memory)
+        return (everything(len(np.unique((scene.gaussians.means < 0) @ np.array([1, 2, 4])))),)
+
+
+@spoils("check_motion_finds_bodies")
+class Blind(Base):
+    """Says that it fits motions to the images, and looks at none."""
+
+    traits = MotionTraits(finds_motion=True)
+
+
+@spoils("check_motion_momentum")
+class Sluggish(Base):
+    """Says that a body keeps half of its motion, and lets it keep all."""
+
+    traits = MotionTraits(momentum=0.5)

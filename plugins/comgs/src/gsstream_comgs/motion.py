@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from gsstream.api import FitContext, Motion, MotionPart, PartConfig, Rng, Scene, WrtRows
+from gsstream.api import FitContext, Motion, MotionPart, MotionTraits, PartConfig, Rng, Scene, WrtRows
 from gsstream.blocks import (
     approximate_by_cells,
     enlargement,
@@ -42,6 +42,7 @@ class KeyPointMotion(MotionPart):
 
     source = "ComGS (NeurIPS 2025)"
     processor_only = "it moves rows by numpy"
+    traits = MotionTraits(finds_motion=True, momentum=0.0)
 
     class Config(PartConfig):
         keypoints: int = Field(default=200, ge=1, le=10_000, description="key points in a frame at most")

@@ -13,6 +13,7 @@ from gsstream.api import (
     FloatArray,
     Motion,
     MotionPart,
+    MotionTraits,
     PartConfig,
     Rng,
     Scene,
@@ -62,6 +63,9 @@ class CoherentMotion(MotionPart):
         votes: float = Field(
             default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in what changed"
         )
+
+    def claims(self) -> MotionTraits:
+        return MotionTraits(finds_motion=True, momentum=self.config.momentum)
 
     def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion, ...]:
         config, start, motions = self.config, scene, []

@@ -16,6 +16,7 @@ from gsstream.api import (
     Layout,
     Motion,
     MotionPart,
+    MotionTraits,
     PartConfig,
     Rng,
     Scene,
@@ -99,6 +100,9 @@ class AnchorMotion(MotionPart):
         rounded: bool = Field(
             default=False, description="round every anchor's motion to these steps while it is fitted"
         )
+
+    def claims(self) -> MotionTraits:
+        return MotionTraits(finds_motion=True, momentum=self.config.momentum)
 
     def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion, ...]:
         config, means = self.config, scene.gaussians.means

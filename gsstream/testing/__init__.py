@@ -12,11 +12,12 @@ from gsstream.testing.cases import scene as scene
 from gsstream.testing.kit import CheckResult as CheckResult
 from gsstream.testing.kit import parametrize_with_checks as parametrize_with_checks
 from gsstream.testing.kit import run_checks as run_checks
+from gsstream.testing.method_driver import MethodUnderTest as MethodUnderTest
 from gsstream.testing.recording import SourceUnderTest as SourceUnderTest
 
 __all__ = [
-    "CheckResult", "SourceUnderTest", "World", "get_case", "images", "make_case", "parametrize_with_checks", "rig",
-    "run_checks", "scene",
+    "CheckResult", "MethodUnderTest", "SourceUnderTest", "World", "get_case", "images", "make_case",
+    "parametrize_with_checks", "rig", "run_checks", "scene",
 ]  # fmt: skip
 
 

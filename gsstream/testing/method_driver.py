@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from gsstream.core.frame import Frame
 from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.frame0.points import gather_points
+from gsstream.engine.method.checked import difference_between
 from gsstream.engine.run.encoder import Encoder
 from gsstream.input.recordings.open import open_source
 from gsstream.method.base import Step, StreamingMethod
@@ -111,6 +112,18 @@ class MethodUnderTest:
     def steps(self) -> list[Step[Any]]:
         """The chain that most checks look at, encoded once."""
         return self.chain()
+
+
+def check_replay(method: MethodUnderTest, steps: Sequence[Step[Any]]) -> None:
+    """Raise AssertionError unless a player that is given the packets alone has the state of every step, bit by bit.
+
+    Compared are the Gaussians, their layout, decoders, and the displacement and groups that later motions start from.
+    """
+    player: PlayerState | None = None
+    for step in steps:
+        player = method.play(player, step.packet.data)
+        difference = difference_between(player, step.state.player)
+        assert not difference, f"frame {player.frame}: expected the encoder's state after the packet, got {difference}"
 
 
 @functools.lru_cache(maxsize=8)

@@ -16,9 +16,9 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray, check_finite
 from gsstream.input.recordings.open import open_source
 from gsstream.method.base import Step
-from gsstream.packet import PlayerState, StreamWriter, quantise_key
+from gsstream.packet import StreamWriter, quantise_key
 from gsstream.testing.cases import fingerprint
-from gsstream.testing.method_driver import FRAMES, SOURCE, MethodUnderTest
+from gsstream.testing.method_driver import FRAMES, SOURCE, MethodUnderTest, check_replay
 from gsstream.testing.registry import check
 
 CUT = 2
@@ -37,13 +37,7 @@ def _bytes(what: str, got: Step[Any], expected: Step[Any]) -> None:
 @check("method", kinds=("method", "streaming_method"))
 def check_method_closed_loop(method: MethodUnderTest) -> None:
     """A fresh player that has the packets alone reaches the encoder's state bit by bit, frame by frame."""
-    player: PlayerState | None = None
-    for step in method.steps:
-        player = method.play(player, step.packet.data)
-        for name, value in step.state.player.gaussians.items():
-            off = np.abs(getattr(player.gaussians, name) - value)
-            drift = float(off.max()) if off.size else 0.0
-            assert drift == 0.0, f"frame {player.frame}: {name} drifted by {drift:.3g}; expected 0, bitwise on the CPU"
+    check_replay(method, method.steps)
 
 
 @check("method", kinds=("method", "streaming_method"))

@@ -19,7 +19,7 @@ from gsstream.input.recordings.open import open_source
 from gsstream.method.base import Step
 from gsstream.metrics.psnr import psnr
 from gsstream.player.render import named_renderer, render
-from gsstream.testing.method_driver import FRAMES, SOURCE, MethodUnderTest
+from gsstream.testing.method_driver import FRAMES, SOURCE, MethodUnderTest, check_replay
 
 #: Sigmas beyond which tiles count as changed.
 THRESHOLD = 6.0
@@ -82,11 +82,7 @@ def effect(slot: str, part: Part) -> str:
 def check_closed_loop(slot: str, part: Part) -> None:
     """Raise AssertionError unless a player reaches the encoder's state bit by bit, and a second run its bytes."""
     method = method_with(slot, part)
-    player, first = None, method.chain()
-    for step in first:
-        player = method.play(player, step.packet.data)
-        for name, value in step.state.player.gaussians.items():
-            same = getattr(player.gaussians, name).tobytes() == value.tobytes()
-            assert same, f"frame {player.frame}: the player's {name} is not the encoder's"
+    first = method.chain()
+    check_replay(method, first)
     for one, other in zip(first, method.chain(), strict=True):
         assert one.packet.data == other.packet.data, f"frame {one.packet.frame}: a second run writes other bytes"

@@ -26,8 +26,6 @@ from gsstream.parts.confidence.uniform import Uniform
 from gsstream.parts.gate.always_open import AlwaysOpen
 from gsstream.parts.optimiser.joint import add_joint, decode_joint, join_features, joint_vjp
 from gsstream.parts.propagation.group_max import GroupMax
-from gsstream.parts.regularizer.none import NoRegularizer
-from gsstream.parts.structure.flat import Flat
 from gsstream.parts.update.additive import Additive, DirectCode
 from gsstream.parts.update.base import AttributeCode, UpdateRule, init_latents, quantise_latents
 from gsstream.parts.update.joint import joint_layout
@@ -62,18 +60,6 @@ def test_different_settings_are_different_parts() -> None:
     assert Uniform() != AlwaysOpen()
 
 
-class TestFlat:
-    def test_every_gaussian_is_its_own_root(self) -> None:
-        points, flat = cloud(20), Flat()
-        anchors = flat.seed(points, rig())
-        scene = make_scene(20).map(torch.from_numpy)
-        hierarchy = flat.build(scene, anchors)
-        hierarchy.validate()
-        assert hierarchy.num_nodes == hierarchy.num_gaussians == 20
-        assert torch.equal(hierarchy.parent, torch.arange(20))
-        assert np.array_equal(anchors.positions.numpy(), points.xyz)
-
-
 class TestGroupMax:
     """The contract kit says the rest: at least each member, no more than the largest, no other group."""
 
@@ -87,33 +73,6 @@ class TestGroupMax:
         index = torch.arange(3)
         hierarchy = Hierarchy(index, index, torch.zeros_like(index))
         assert torch.equal(GroupMax().propagate(logits, hierarchy), logits)
-
-
-class TestAlwaysOpen:
-    def test_everything_passes(self) -> None:
-        gate = AlwaysOpen()
-        state = gate.bound(gate.init(torch.tensor([-50.0, 0.0, 50.0])))
-        assert gate.num_levels == 1
-        assert gate.noise(3, torch.Generator()) is None
-        assert torch.equal(gate.sample(state, None), torch.ones(3))
-        assert torch.equal(gate.open_probability(state), torch.ones(3))
-        assert gate.sample(gate.init(torch.zeros(0)), None).shape == (0,)
-
-
-def test_uniform_is_one_logit_each() -> None:
-    class Context:
-        gaussians = make_scene(7).map(torch.from_numpy)
-
-    found = Uniform(Uniform.Config(logit=2.5)).estimate(Context())  # type: ignore[arg-type]
-    assert torch.equal(found, torch.full((7,), 2.5))
-    with pytest.raises(ValidationError, match="logit"):
-        Uniform.Config(logit=51)
-
-
-def test_no_regularizer_has_no_terms() -> None:
-    index = torch.arange(2)
-    hierarchy = Hierarchy(index, index, torch.zeros_like(index))
-    assert NoRegularizer().penalty(torch.ones(2), torch.ones(2, 3), hierarchy, 2) == {}
 
 
 class TestAdditive:

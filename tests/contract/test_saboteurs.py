@@ -9,6 +9,7 @@ import pytest
 from distribution import write_metadata
 from saboteurs import COMMAND_SABOTEURS, INSTALLED, METHOD_SABOTEURS, PACKET_SABOTEURS, SABOTEURS
 
+from gsstream.testing import MethodUnderTest
 from gsstream.testing.kit import (
     CheckResult,
     all_checks,
@@ -18,7 +19,6 @@ from gsstream.testing.kit import (
     run_packet_checks,
     run_subject,
 )
-from gsstream.testing.method_driver import MethodUnderTest
 
 
 def failed(results: list[CheckResult]) -> dict[str, str]:

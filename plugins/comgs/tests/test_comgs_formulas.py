@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from gsstream.api import Gaussians, apply_motion
 from gsstream.blocks import approximate_by_cells, rotation_matrices, transform_rows
-from gsstream.testing.method_driver import MethodUnderTest
+from gsstream.testing import MethodUnderTest
 from tests.scenes import scene_at
 
 RNG = np.random.default_rng(0)

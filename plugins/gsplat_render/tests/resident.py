@@ -15,7 +15,7 @@ from gsstream.core.part import PartConfig
 from gsstream.parts.loss.photometric import ReferenceLoss
 from gsstream.parts.optimiser.adam import ReferenceAdam
 from gsstream.parts.render.base import Renderer, RenderOutput
-from gsstream.testing.method_driver import MethodUnderTest
+from gsstream.testing import MethodUnderTest
 from gsstream.testing.pretend import DEVICE, kernel
 
 ON_DEVICE = Kernels(*(kernel(getattr(TORCH_KERNELS, field.name)) for field in fields(Kernels)))

@@ -12,7 +12,7 @@ from gsstream_quarc.growth import ChangeGatedCopies, change_scores
 
 from gsstream.api import Cameras, Gaussians
 from gsstream.blocks import pixel_size
-from gsstream.testing.method_driver import MethodUnderTest
+from gsstream.testing import MethodUnderTest
 
 RNG = np.random.default_rng(0)
 

@@ -11,7 +11,7 @@ from gsstream_recon.motion import AnchorMotion
 
 from gsstream.api import Delta, Displacement, Layout, Rng, Scene, apply_motion
 from gsstream.blocks import pixel_size
-from gsstream.testing.method_driver import MethodUnderTest
+from gsstream.testing import MethodUnderTest
 from tests.scenes import RIG, SquaredDistances, scene_at
 
 RNG = np.random.default_rng(0)

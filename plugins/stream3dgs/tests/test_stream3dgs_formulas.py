@@ -12,7 +12,7 @@ from gsstream_stream3dgs.motion import CacheMotion
 
 from gsstream.api import Delta, Rng, Scene, apply_delta, apply_field, field_rows
 from gsstream.blocks import transform_rows
-from gsstream.testing.method_driver import MethodUnderTest
+from gsstream.testing import MethodUnderTest
 from tests.scenes import RIG, SquaredDistances, scene_at
 
 RNG = np.random.default_rng(0)

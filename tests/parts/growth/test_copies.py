@@ -11,7 +11,7 @@ import pytest
 from gsstream.method.base import Step
 from gsstream.parts.growth.copying import Copies
 from gsstream.parts.update.none import NoUpdate
-from gsstream.testing.method_driver import MethodUnderTest
+from gsstream.testing import MethodUnderTest
 
 
 def steps_with(**settings: Any) -> list[Step[Any]]:

@@ -13,7 +13,10 @@ Out = Annotated[Path, typer.Option("--out", help="Output folder; must not hold a
 Recipes = Annotated[
     list[Path] | None,
     typer.Option(
-        "--recipe", metavar="FILE", help="YAML file with differences from the method's recipe; repeatable, last wins."
+        "--recipe",
+        metavar="FILE|recording:NAME",
+        help="YAML file with differences from the method's recipe, or one of gsstream's own (recording:n3dv, "
+        "recording:live ...); repeatable, last wins.",
     ),
 ]
 Settings = Annotated[

@@ -6,7 +6,7 @@ import json
 import re
 import shlex
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -48,7 +48,7 @@ def run(
 ) -> None:
     """Encode a recording as a stream of 3D Gaussians.
 
-    The recipe is the method's, changed by --recipe FILE, then --set and the short options. Ctrl-C (exit code 130) and
+    The recipe is the method's, changed by --recipe, then --set and the short options. Ctrl-C (exit code 130) and
     SIGTERM (143) end after the current frame, before frame 0 is written at once; --resume goes on to the same bytes.
     """
     from gsstream.core.install_hints import require_encoder
@@ -60,7 +60,7 @@ def run(
     catalog = load_catalog()
     resolved = resolve_recipe(recipe.method, catalog.recipe_path, recipe.recipe or (), recipe.overrides())
     server, wanted, quiet = server_beside(out, serve), shown.wanted(), shown.quiet
-    say, named = _silent if quiet else _note, bool(recipe.method or recipe.recipe)
+    say = _silent if quiet else _note
     with working("loading the method", quiet) as display:
         # The slow imports come last: a mistake on the command line is answered at once.
         from gsstream.engine.assembly.assemble import assemble
@@ -74,7 +74,7 @@ def run(
         recording = open_recording(source, assembly.recipe, catalog)
     try:
         say(assembly.note)
-        _reused_lines(say, resolved.recipe, recording.info, named=named, catalog=catalog)
+        _reused_lines(say, resolved.recipe, recording.info, given=recipe, catalog=catalog)
         _first_look(recording, source, quiet, again=resume)
         with claim_output(out, resume=resume, overwrite=overwrite), ended_by_signals() as came, serving(server):
             try:
@@ -104,18 +104,32 @@ def _silent(_: str) -> None:
 
 
 def _reused_lines(
-    say: Callable[[str], None], recipe: Recipe, info: SourceInfo, *, named: bool, catalog: Catalog
+    say: Callable[[str], None], recipe: Recipe, info: SourceInfo, *, given: options.RecipeOptions, catalog: Catalog
 ) -> None:
-    """Print the defaults that were taken: method, number of frames, and that no camera is held out."""
-    if not named:
+    """Print the defaults that were taken: method, recipe of the recording, frames, and that no camera is held out."""
+    if not (given.method or given.recipe):
         better = next((name for name in SUGGESTED if ("method", name) in catalog.entries), None)
         advice = "" if better is None else f"; --method {better} makes far smaller packets"
         say(f"no --method given: taking {recipe.method!r}, in which everything may change{advice}")
+    say(_proposed(info.uri, given.recipe or ()))
     if recipe.frames is not None and info.num_frames is not None and info.num_frames < recipe.frames:
         say(f"{recipe.frames} frames are wanted, the recording has {info.num_frames}: encoding {info.num_frames}")
     if len(info.test) == 0:
         some = f", e.g. --set {_held_out(info.train.ids[0])}" if len(info.train) > 2 else ""
         say(f"no camera is held out, so no quality is measured{some}")
+
+
+def _proposed(source: str, given: Sequence[Path]) -> str:
+    """The line that names the recipe which is meant for a recording; nothing where it is among those given."""
+    from gsstream.recipe.shipped import SCHEME, meant_for, recipe_file
+
+    name = meant_for(source)
+    if name is None or recipe_file(f"{SCHEME}{name}").resolve() in [recipe_file(path).resolve() for path in given]:
+        return ""
+    return (
+        f"this recording has the layout of a published data set: --recipe {SCHEME}{name} sets its split, size "
+        "and frames (nothing of it is applied unless you say so)"
+    )
 
 
 def _held_out(camera: str) -> str:

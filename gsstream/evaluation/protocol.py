@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -44,7 +45,7 @@ PROTOCOLS: Mapping[str, EvaluationProtocol] = MappingProxyType(
             None,
             300,
             "Neural 3D Video (Li et al. 2022), as 3DGStream and S2GS measure it",
-            "run with --recipe configs/recordings/n3dv.yaml",
+            "run with --recipe recording:n3dv",
         ),
         "meetroom": EvaluationProtocol(
             1280,
@@ -53,7 +54,7 @@ PROTOCOLS: Mapping[str, EvaluationProtocol] = MappingProxyType(
             12,
             300,
             "StreamRF (Li et al. 2022), as 3DGStream and S2GS measure it",
-            "run with --recipe configs/recordings/meetroom.yaml",
+            "run with --recipe recording:meetroom",
         ),
     }
 )
@@ -78,9 +79,10 @@ def check_protocol(name: str, info: SourceInfo, leak: str, frames: Sequence[int]
     Raises InputError, and UnknownName for another protocol.
     """
     wanted, rig = find_protocol(name), info.test
+    test = wanted.test if _numbered(rig.ids) == _numbered(wanted.test) else rig.ids
     found = {
         "pictures": (f"{wanted.width} x {wanted.height}", f"{rig.width} x {rig.height}"),
-        "test cameras": (", ".join(sorted(wanted.test)), ", ".join(sorted(rig.ids)) or "none"),
+        "test cameras": (", ".join(sorted(wanted.test)), ", ".join(sorted(test)) or "none"),
         "training cameras": (wanted.train or len(info.train), len(info.train)),
         "data.leak": ("none", leak),
     }
@@ -92,6 +94,11 @@ def check_protocol(name: str, info: SourceInfo, leak: str, frames: Sequence[int]
             f"--protocol {name}: frames: expected 0 to at most {wanted.frames - 1}, got {frames[0]} to {frames[-1]}; "
             f"say --frames 0:{wanted.frames}"
         )
+
+
+def _numbered(cameras: Sequence[str]) -> list[str]:
+    """The cameras in order, without leading zeros: cam0 of one copy of a recording is cam00 of another."""
+    return sorted(re.sub(r"\d+", lambda number: str(int(number.group())), name) for name in cameras)
 
 
 def protocol_numbers(name: str, evaluation: Evaluation) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from gsstream.core.errors import RecipeError
+from gsstream.recipe.shipped import hint
 
 KeyPath = tuple[str, ...]
 #: Bytes of a recipe file; a whole recipe with all its settings has about 5 KB.
@@ -105,6 +106,8 @@ def _text_of(path: Path) -> str:
         if len(content) > LONGEST:
             raise RecipeError(f"{path}: expected at most {LONGEST // 1000} KB of YAML, as a recipe has; got more")
         return content.decode("utf-8")
+    except FileNotFoundError as error:
+        raise RecipeError(f"cannot read the recipe {path}: {error}{hint(path)}") from error
     except (OSError, ValueError) as error:  # ValueError: no UTF-8, or a name with a NUL
         if isinstance(error, RecipeError):
             raise

@@ -1,6 +1,7 @@
 """Layers -> one recipe: model defaults <- the method's file <- recipe files <- the command line.
 
 A file may say ``base: NAME`` (a method) or ``base: other.yaml`` (a file beside it) and then only its differences.
+``recording:NAME`` in place of a file is a recipe that gsstream ships.
 Naming another part in a slot drops the parameters that lower layers gave to the former one.
 """
 
@@ -27,6 +28,7 @@ from gsstream.recipe.document import (
     read_override,
 )
 from gsstream.recipe.model import Recipe
+from gsstream.recipe.shipped import label_of, recipe_file
 
 #: Finds the YAML file of a named method; raises UnknownName or PluginUnavailable.
 FindMethod = Callable[[str], Path]
@@ -66,8 +68,9 @@ def resolve_recipe(
 
     Raises:
         RecipeError: unknown keys (with the nearest valid name), values out of range, contradictions.
-        UnknownName, PluginUnavailable: from ``find_method``.
+        UnknownName, PluginUnavailable: from ``find_method``; UnknownName also for a ``recording:NAME`` of ``files``.
     """
+    files = [recipe_file(file) for file in files]
     chain = [layer for file in files[:1] for layer in _file_chain(file, find_method, ())]
     later = [layer for file in files[1:] for layer in _later_file(file, find_method)]
     stated = [layer.leaves[("method",)] for layer in chain if ("method",) in layer.leaves]
@@ -162,7 +165,7 @@ def _method_chain(name: str, find_method: FindMethod, within: tuple[str, ...]) -
 
 def _file_chain(path: Path, find_method: FindMethod, within: tuple[str, ...], label: str | None = None) -> list[Layer]:
     """The layers of a file: those of its base, then its own."""
-    layer = read_file(path, label)
+    layer = read_file(path, label or label_of(path))
     key = str(path.resolve())
     leaves = dict(layer.leaves)
     base = leaves.pop(("base",), None)
@@ -171,7 +174,7 @@ def _file_chain(path: Path, find_method: FindMethod, within: tuple[str, ...], la
     if not isinstance(base.value, str):
         raise RecipeError(f"{base.origin.where}: base: expected the name of a method or a file, got {base.value!r}")
     method = re.fullmatch(r"[a-z][a-z0-9_-]*", base.value) is not None
-    target = find_method(base.value) if method else path.parent / base.value
+    target = find_method(base.value) if method else recipe_file(base.value, path.parent)
     if not is_file(target):
         raise RecipeError(f"{base.origin.where}: base: there is no file {target}")
     circle = (*within, key, str(target.resolve()))

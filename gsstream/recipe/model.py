@@ -145,7 +145,7 @@ class Stream(Section):
         if (self.refine_frames > 0) != (self.refine_iterations > 0):
             raise ValueError(
                 "expected refine_frames and refine_iterations both 0 or both above 0, got "
-                f"{self.refine_frames} and {self.refine_iterations}; set both, as configs/live.yaml does"
+                f"{self.refine_frames} and {self.refine_iterations}; set both, as --recipe recording:live does"
             )
         return self
 

@@ -51,8 +51,7 @@ OPTIONS = {
     ],
     "gsstream info": ["STREAM", "--json"],
     "gsstream evaluate": [
-        "STREAM", "--source", "--ply-sequence", "--renders", "--files", "--first", "--frames", "--recipe", "--scale",
-        "--lpips-onnx", "--lpips-range", "--protocol", "--json", "--max-memory",
+        "STREAM", "--source", "--frames", "--lpips-onnx", "--lpips-range", "--protocol", "--json", "--max-memory",
     ],
     "gsstream methods": ["NAME", "--full"],
     "gsstream recipe": ["METHOD", "--recipe", "--set", "--full", "--schema"],
@@ -62,7 +61,7 @@ OPTIONS = {
     "gsstream new-plugin": ["NAME", "--kind", "--out"],
 }  # fmt: skip
 #: Most of each that gsstream itself may have; what measures is in gsstream-lab.
-COMMANDS, ALL_OPTIONS = 14, 90
+COMMANDS, ALL_OPTIONS = 14, 70
 
 
 @pytest.fixture(autouse=True)

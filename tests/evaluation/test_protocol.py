@@ -40,6 +40,13 @@ def test_what_fits_is_admitted_in_whatever_order_cameras_come(name: str) -> None
     check_protocol(name, recording(name, test=PROTOCOLS[name].test[::-1]), "none", [0, 1])
 
 
+def test_the_layout_of_the_data_set_names_the_same_cameras_without_leading_zeros() -> None:
+    test = ("cam0", "cam10", "cam15", "cam30")  # as panoptic:DIR names them
+    check_protocol("panoptic-sports", recording("panoptic-sports", test=test), "none", [0, 1])
+    with pytest.raises(InputError, match="got cam1, cam10, cam15, cam30"):
+        check_protocol("panoptic-sports", recording("panoptic-sports", test=("cam1", *test[1:])), "none", [0, 1])
+
+
 @pytest.mark.parametrize("name", PROTOCOLS)
 @pytest.mark.parametrize(
     ("other", "leak", "what"),
@@ -103,5 +110,5 @@ def test_a_run_and_its_pictures_are_measured_by_the_same_protocol(
     assert found["psnr"] == pytest.approx(np.mean([view["psnr"] for view in views]))
     assert run_command(["play", str(run), "--camera", "test", "--out", str(pictures)]) == 0
     capsys.readouterr()
-    assert run_command(["evaluate", "--renders", str(pictures), "--source", SOURCE, "--protocol", "tiny"]) == 0
+    assert run_command(["evaluate-files", "--renders", str(pictures), "--source", SOURCE, "--protocol", "tiny"]) == 0
     assert "protocol tiny of a test: PSNR " in capsys.readouterr().out

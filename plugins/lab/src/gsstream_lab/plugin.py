@@ -10,6 +10,10 @@ COMMANDS = {
     "sweep": ("sweep:sweep", "Run every recipe of a sweep on every scene with every seed."),
     "report": ("report:report", "Write report.html (one file, no network), report.md and its figures."),
     "compare": ("compare:compare", "Encode one recording with several methods and show them side by side."),
+    "evaluate-files": (
+        "evaluate_files:evaluate_files",
+        "Compare Gaussians or pictures of another program with the test cameras.",
+    ),
     "tune": ("tune:tune", "Try a few recipes on a few frames and write the best that fits a budget as tuned.yaml."),
     "search": ("search:search", "Look for settings of a recording and write the recipe as found.yaml."),
     "gap": ("gap:gap", "Reconstruct frames of a run from their own images alone and say how much better they are."),

@@ -24,7 +24,12 @@ class RecordingOptions:
 
     source: Annotated[str, typer.Option("--source", help="demo, synthetic:K=V&..., DIR, or LAYOUT:DIR.")]
     recipe: Annotated[
-        Path | None, typer.Option("--recipe", help="YAML file with what the recording needs, for all methods.")
+        Path | None,
+        typer.Option(
+            "--recipe",
+            metavar="FILE|recording:NAME",
+            help="What the recording needs, for all methods: a YAML file, or one of gsstream's own.",
+        ),
     ] = None
     settings: options.Settings = None
     frames: Annotated[int | None, typer.Option("--frames", help="Number of frames; default: all, in pilots 5.")] = None
@@ -33,6 +38,7 @@ class RecordingOptions:
     def scene(self, frames: int | None = None) -> Scene:
         """Return the recording as the scene of a sweep. Raises RecipeError for a ``--set`` that is not KEY=VALUE."""
         from gsstream.recipe.document import read_override
+        from gsstream.recipe.shipped import recipe_file
         from gsstream_lab.sweep.config import Scene
 
         return Scene(
@@ -40,7 +46,7 @@ class RecordingOptions:
             uri=self.source,
             scale=self.scale,
             frames=self.frames or frames,
-            recipe=None if self.recipe is None else str(self.recipe.resolve()),
+            recipe=None if self.recipe is None else str(recipe_file(self.recipe).resolve()),
             set={".".join(path): leaf.value for path, leaf in map(read_override, self.settings or ())},
         )
 

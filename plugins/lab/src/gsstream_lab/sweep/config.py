@@ -15,6 +15,7 @@ from gsstream.core.errors import RecipeError
 from gsstream.input.recordings.options import SplitName
 from gsstream.recipe.check import Model, join_problems, validate
 from gsstream.recipe.document import Empty, Origin, read_file
+from gsstream.recipe.shipped import recipe_file
 
 SCHEMA_VERSION = "1.0"
 _NAME = r"^[A-Za-z0-9][\w.+-]*$"
@@ -50,7 +51,9 @@ class Scene(Section):
 
     name: str = Field(pattern=_NAME, description="name in tables")
     uri: str = Field(description="as for --source; a relative folder is looked up in --data")
-    recipe: str | None = Field(default=None, description="recipe file with what this recording needs")
+    recipe: str | None = Field(
+        default=None, description="recipe file with what this recording needs, or recording:NAME"
+    )
     scale: float | None = Field(default=None, gt=0, le=1, description="images are downscaled by this factor")
     frames: int | None = Field(default=None, ge=1, description="number of frames; all when absent")
     set: dict[str, Any] = Field(default_factory=dict, description="recipe keys for this recording")
@@ -193,7 +196,7 @@ def read_sweep(path: Path, scenes: Path | None = None, split: SplitName | None =
     if scenes is None:
         return config
     found = [
-        scene.model_copy(update={"recipe": os.path.relpath(scenes.parent / scene.recipe, path.parent)})
+        scene.model_copy(update={"recipe": os.path.relpath(recipe_file(scene.recipe, scenes.parent), path.parent)})
         if scene.recipe
         else scene
         for scene in _read(scenes, SceneList).scenes

@@ -15,6 +15,7 @@ from typing import Any
 from gsstream.recipe.document import Layer, Leaf, Origin
 from gsstream.recipe.load import FindMethod, ResolvedRecipe, recipe_hash, resolve_recipe
 from gsstream.recipe.model import LATER_KEYS
+from gsstream.recipe.shipped import recipe_file
 from gsstream_lab.sweep.config import Axis, Range, Scene, SweepConfig, Variant, flat_settings
 from gsstream_lab.sweep.rows import with_bases
 
@@ -171,7 +172,7 @@ def _resolve(
         (f"axes of variant {variant.name}", axes),
         (f"scene {scene.name}", {key: value for key, value in size.items() if value is not None}),
     ]
-    files = [folder / name for name in (variant.recipe, scene.recipe) if name]
+    files = [recipe_file(name, folder) for name in (variant.recipe, scene.recipe) if name]
     layers = []
     for where, values in written:
         origin = Origin(f"sweep, {where}", f"sweep, {where}")

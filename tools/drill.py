@@ -1,7 +1,7 @@
 """A live drill: play a finished recording into a folder at a given rate, follow it with ``gsstream run``, and report.
 
 Usage: python -m tools.drill --source demo --fps 7.5 --frames 60 --out DIR [--watch "behind=drop&queue=2"]
-       [-- --method s2gs-edge --recipe configs/live.yaml --budget time=0.2 ...]
+       [-- --method s2gs-edge --recipe recording:live --budget time=0.2 ...]
 
 What follows ``--`` goes to ``gsstream run``. The recording runs there and back again for as many frames as are asked
 for. The capture begins when the run waits for it. Writes DIR/capture (the growing recording), DIR/run (of gsstream run)

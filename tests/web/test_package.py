@@ -21,6 +21,7 @@ from gsstream.player.playback import Playback
 from gsstream.serve.package import package
 
 WEB = Path(__file__).parents[2] / "gsstream" / "web"
+EXAMPLES = WEB.parents[1] / "docs" / "examples"
 
 
 def write(path: Path, **settings: int) -> Path:
@@ -33,6 +34,30 @@ def write(path: Path, **settings: int) -> Path:
 def segments(folder: Path) -> list[str]:
     manifest = json.loads((folder / "stream.json").read_text())
     return [s["file"] for entry in (manifest, *manifest["renditions"]) for s in entry["segments"]]
+
+
+def test_every_module_is_one_that_the_page_may_load():
+    """What is for scripts alone lies in ``docs/examples``."""
+    found, waiting = set(), ["index.html"]
+    while waiting:
+        name = waiting.pop()
+        if name in found:
+            continue
+        found.add(name)
+        text, folder = (WEB / name).read_text(encoding="utf-8"), (WEB / name).parent
+        named = re.findall(r"""(?:from|import|URL|href=|src=)[ (]*["']((?:\.\.?/)?[\w/.-]+\.js)["']""", text)
+        waiting += [(folder / path).resolve().relative_to(WEB).as_posix() for path in named]
+    there = {path.relative_to(WEB).as_posix() for path in WEB.rglob("*.js")}
+    assert found - {"index.html"} == there
+    assert len(there) > 20
+
+
+@pytest.mark.parametrize("example", sorted(EXAMPLES.rglob("*.js")), ids=lambda path: path.name)
+def test_examples_import_what_a_package_exports(example):
+    text = example.read_text(encoding="utf-8")
+    for names, module in re.findall(r"""import \{ ([^}]*) \} from "\./site/([\w-]+\.js)";""", text):
+        exported = set(re.findall(r"^export (?:const|class|function) (\w+)", (WEB / module).read_text(), re.MULTILINE))
+        assert set(names.split(", ")) <= exported, module
 
 
 def test_segments_hold_the_bytes_of_the_stream(tmp_path):

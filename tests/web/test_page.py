@@ -265,10 +265,9 @@ def test_the_page_is_small(site):
     files = [p.relative_to(folder) for p in folder.rglob("*") if p.is_file() and "vendor" not in p.parts]
     sizes = {str(name): len(gzip.compress((site / name).read_bytes())) for name in files}
     # What only a live stream takes, a seek by a join, a stream without a package, a packet with layers and the
-    # statistics is loaded only there; the adapter for three.js and what is for scripts alone never.
+    # statistics is loaded only there.
     names = ("live", "live-socket", "latency", "joins", "file", "statistics", "layers", "early")
     later = [sizes.pop(f"{name}.js") for name in names]
-    del sizes["gsstream-spark.js"], sizes["world.js"]
     assert len(sizes) > 20
     assert sum(sizes.values()) <= 60_000
     assert sum(later) <= 11_900

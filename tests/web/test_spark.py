@@ -51,7 +51,8 @@ def test_pictures_and_uploads(tmp_path):
         for packet in moving_packets(seed=9, frames=6, number=300, sh_rest=3, key_at=99):
             writer.append(packet)
     package(stream, tmp_path / "page" / "site")
-    shutil.copy(ROOT / "docs" / "examples" / "spark" / "index.html", tmp_path / "page")
+    for name in ("index.html", "gsstream-spark.js"):
+        shutil.copy(ROOT / "docs" / "examples" / "spark" / name, tmp_path / "page")
     (tmp_path / "page" / "node_modules").symlink_to(MODULES)
     rig = make_meta().test
     frames = [0, 3, 5]

@@ -2,8 +2,9 @@
 
 import { readFileSync } from "node:fs";
 
+import { poseInRecording, toRecording, worldOf } from "../../docs/examples/world.js";
 import { viewsOf } from "../../gsstream/web/camera.js";
-import { isWorld, poseInRecording, toRecording, worldOf } from "../../gsstream/web/world.js";
+import { isWorld } from "../../gsstream/web/meta.js";
 
 const { meta, points, candidates } = JSON.parse(readFileSync(process.argv[2], "utf8"));
 const world = worldOf(meta);

@@ -1,14 +1,15 @@
 // A stream as an object of a three.js scene, drawn by Spark (@sparkjsdev/spark). The page's import map, or a bundler,
-// says where "three" and "@sparkjsdev/spark" are. Spark draws, sorts and blends; the attributes lie in float32 textures
+// says where "three" and "@sparkjsdev/spark" are; the other modules are those of a package, in the folder "site" beside
+// this file. Spark draws, sorts and blends; the attributes lie in float32 textures
 // of this module, of which only changed rows are uploaded.
 
 import { SplatMesh, dyno } from "@sparkjsdev/spark";
 import * as THREE from "three";
 
-import { pivotOf, viewsOf } from "./camera.js";
-import { Player } from "./player.js";
-import { ResidentScene } from "./resident.js";
-import { GEOMETRY_TEXELS, colourFunction, colourTexels } from "./shaders.js";
+import { pivotOf, viewsOf } from "./site/camera.js";
+import { Player } from "./site/player.js";
+import { ResidentScene } from "./site/resident.js";
+import { GEOMETRY_TEXELS, colourFunction, colourTexels } from "./site/shaders.js";
 
 /** Options of a SparkRenderer with which pictures look as these scenes were trained. */
 export const AS_TRAINED = {

@@ -1,7 +1,5 @@
 // Where a stream's coordinates lie in those of its recording: x_recording = scale * rotation x_stream + offset.
-// The page does not load this module; it is for scripts.
-
-export { isWorld } from "./meta.js";
+// For scripts beside a package or a page of your own: copy this module; it imports nothing.
 
 const IDENTITY = { rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1], offset: [0, 0, 0], scale: 1 };
 

@@ -2,13 +2,13 @@
 
 ::
 
-    from gsstream.encode import Encoder, StreamWriter, encoder_for, open_recording
+    from gsstream.encode import encode, open_recording
 
-    with open_recording("demo") as source, StreamWriter.open("demo.gss") as writer:
-        encoder = encoder_for("s2gs-fast", source)
-        for index in range(3):
-            writer.append(encoder.encode(source.frame(index)).packet)
+    with open_recording("demo") as source:
+        for step in encode("s2gs-edge", source, {"frames": 3}, out="demo.gss"):
+            print(step.status, len(step.packet.data))
 
+:func:`encoder_for` gives the encoder alone, for frames in a loop of your own.
 A method is also composed: parts that are given, live or by name, take the places of those in the recipe of a method.
 That of ``dense`` groups nothing, moves nothing, opens every gate and corrects every Gaussian::
 
@@ -23,12 +23,14 @@ A whole method is given as ``streaming_method``. Classes of live parts need not 
 
 from __future__ import annotations
 
+import itertools
+import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from typing import Any, TypedDict, Unpack
+from contextlib import contextmanager, nullcontext
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from gsstream.core.cameras import Cameras as Cameras
-from gsstream.core.errors import InputError
+from gsstream.core.errors import EndOfRecording, InputError
 from gsstream.core.frame import Frame as Frame
 from gsstream.core.world import rig_similarity, snap_cameras
 from gsstream.discovery.catalog import load_catalog
@@ -56,9 +58,12 @@ from gsstream.parts.update.base import UpdateRule
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe as Recipe
 
+if TYPE_CHECKING:
+    from gsstream.discovery.catalog import Catalog
+
 __all__ = [
     "Assembly", "Callbacks", "Cameras", "Encoder", "Frame", "FrameSource", "Parts", "Recipe", "Step", "StreamWriter",
-    "encoder_for", "encoder_for_rig", "open_recording", "recipe_for", "to_rig_coordinates",
+    "encode", "encoder_for", "encoder_for_rig", "open_recording", "recipe_for", "to_rig_coordinates",
 ]  # fmt: skip
 
 
@@ -90,8 +95,12 @@ def recipe_for(method: str, settings: Mapping[str, Any] | None = None) -> Recipe
 
     Raises UnknownName or RecipeError as ``gsstream run`` does.
     """
+    return _recipe(method, settings, load_catalog())
+
+
+def _recipe(method: str, settings: Mapping[str, Any] | None, catalog: Catalog) -> Recipe:
     changes = [("settings", f"{key}={value}") for key, value in (settings or {}).items()]
-    return resolve_recipe(method, load_catalog().recipe_path, (), changes).recipe
+    return resolve_recipe(method, catalog.recipe_path, (), changes).recipe
 
 
 @contextmanager
@@ -124,6 +133,52 @@ def to_rig_coordinates(source: FrameSource) -> FrameSource:
     return CanonicalSource(source, recording_similarity(source))
 
 
+def encode(
+    method: str,
+    source: FrameSource,
+    settings: Mapping[str, Any] | None = None,
+    *,
+    out: str | os.PathLike[str] | None = None,
+    listeners: Callbacks | None = None,
+    **parts: Unpack[Parts],
+) -> Iterator[Step[Any]]:
+    """Return an iterator that encodes a recording, one frame for each :class:`Step` that it yields.
+
+    The iterator ends with the recording, or after as many frames as the setting ``frames`` says. A loop that is left
+    early leaves a whole stream of the frames so far.
+
+    Arguments:
+        method: a name of ``gsstream methods``.
+        source: an open recording, as for :func:`encoder_for`.
+        settings: as for :func:`recipe_for`.
+        out: file of the stream, which must not exist; every packet is in it before its step is yielded. None: no file.
+        listeners: as for :func:`encoder_for`.
+        parts: as for :func:`encoder_for`.
+
+    Raises what :func:`encoder_for` raises at once, and while it is iterated what :meth:`Encoder.encode` raises, and
+    SourceError for a frame that cannot be read.
+    """
+    return _steps(encoder_for(method, source, settings, listeners, **parts), source, out)
+
+
+def _steps(encoder: Encoder, source: FrameSource, out: str | os.PathLike[str] | None) -> Iterator[Step[Any]]:
+    with nullcontext() if out is None else StreamWriter.open(out) as writer:
+        for index in itertools.islice(itertools.count(), encoder.assembly.recipe.frames):
+            if index == source.info.num_frames:  # asked each time: a recording that grows may end
+                return
+            try:
+                frame = source.frame(index)
+            except EndOfRecording:
+                return
+            step = encoder.encode(frame)
+            if writer is not None:
+                writer.append(step.packet)
+            try:
+                yield step
+            except GeneratorExit:  # the loop was left: the writer ends the file as after the last frame
+                return
+
+
 def encoder_for(
     method: str,
     source: FrameSource,
@@ -147,8 +202,7 @@ def encoder_for(
     def seeds(frame: Frame) -> Any:
         return gather_points(source, frame, assembly.recipe.first_frame)
 
-    encoder = Encoder(assembly, source.info, seeds, callbacks=listeners)
-    return encoder
+    return Encoder(assembly, source.info, seeds, callbacks=listeners)
 
 
 def encoder_for_rig(
@@ -197,4 +251,5 @@ def _assembled(method: str, settings: Mapping[str, Any] | None, parts: Parts) ->
     for key in settings or {}:
         if key.partition(".")[0] in live:
             raise InputError(f"{key}: the part is given live, with settings of its own; make it with this one")
-    return assemble(recipe_for(method, {**named, **(settings or {})}), load_catalog(), live=live)
+    catalog = load_catalog()
+    return assemble(_recipe(method, {**named, **(settings or {})}, catalog), catalog, live=live)

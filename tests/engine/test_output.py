@@ -137,6 +137,7 @@ def test_other_errors_pass_unchanged(tmp_path) -> None:
 
 def test_a_kill_while_metrics_are_trimmed_loses_no_line(tmp_path, monkeypatch) -> None:
     path = tmp_path / "metrics.jsonl"
+    path.touch()
     for frame in range(3):
         append_metrics(path, {"frame": frame})
     before = path.read_bytes()
@@ -162,10 +163,17 @@ def test_a_line_without_room_leaves_no_half(tmp_path) -> None:
         "for frame in range(9): append_metrics(Path(sys.argv[1]), {'frame': frame, 'psnr': 1.5})\n"
     )
     path = tmp_path / "metrics.jsonl"
+    path.touch()
     done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=False)
     assert "OutputError" in done.stderr or "File too large" in done.stderr
     assert [json.loads(line)["frame"] for line in path.read_text().splitlines()] == [0]
     assert path.read_bytes().endswith(b"\n")
+
+
+def test_a_log_that_is_deleted_while_its_run_goes_on_ends_the_run(tmp_path) -> None:
+    with pytest.raises(OutputError, match=r"cannot write .*metrics.jsonl: No such file .*do not move or delete"):
+        append_metrics(tmp_path / "metrics.jsonl", {"frame": 3})
+    assert not (tmp_path / "metrics.jsonl").exists()
 
 
 def test_what_a_shell_started_in_the_background_is_ended_by_sigterm_too() -> None:

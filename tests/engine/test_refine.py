@@ -71,7 +71,7 @@ def test_a_still_scene_is_refined_and_a_key_packet_brings_it() -> None:
     assert made[3].metrics["key_reason"] == "refined"
     assert [step.state.refinement is None for step in made] == [True, False, False, True, True, True]
     held_out = HeldOut(encoder().assembly.renderer)
-    before, after = (held_out.measure(made[t].state, frames("test")[t])["psnr"] for t in (2, 3))
+    before, after = (held_out.measure(made[t].state.player, frames("test")[t])["psnr"] for t in (2, 3))
     assert min(after[name] - before[name] for name in before) > 1, "sixty iterations after ten"
 
 

@@ -73,7 +73,7 @@ def encode(parts: Assembly, source: FrameSource) -> tuple[dict[str, float], str]
         for name in ATTRIBUTES:
             values = getattr(step.state.player.gaussians, name)
             digest.update(np.ascontiguousarray(values).tobytes())
-        test = held_out.measure(step.state, encoder.with_near_plane(source.frame(index, "test")))
+        test = held_out.measure(step.state.player, encoder.with_near_plane(source.frame(index, "test")))
         line = {name: next(iter(test[name].values())) for name in ("psnr", "psnr_moving")}
         lines.append({**line, "kb": len(step.packet.data) / 1000})
     found = {"psnr_0": lines[0]["psnr"], "key_kb": lines[0]["kb"]}

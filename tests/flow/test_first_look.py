@@ -129,7 +129,7 @@ class Shown(HeldOut):
     def __init__(self, sound: bool) -> None:
         self.sound = sound
 
-    def render(self, state: object, frame: Frame, view: int) -> np.ndarray:
+    def render(self, player: object, frame: Frame, view: int) -> np.ndarray:
         return np.clip(frame.images[view] + 0.02, 0, 1) if self.sound else np.zeros_like(frame.images[view])
 
 

@@ -49,7 +49,7 @@ def changed(scene: str, motion: str, first: PlayerState | None, frames: int) -> 
         frame = source.frame(index)
         step = encoder.encode(frame)
         first = first or step.state.player
-        views = held.measure(step.state, encoder.with_near_plane(frame))["psnr_changed"].values()
+        views = held.measure(step.state.player, encoder.with_near_plane(frame))["psnr_changed"].values()
         found.append(mean(math.nan if view is None else view for view in views))
     assert first is not None
     return first, found

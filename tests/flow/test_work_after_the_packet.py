@@ -92,8 +92,7 @@ def test_a_run_killed_in_the_refinement_resumes_to_the_same_bytes(
     told = f"frame {frame} of the stream is made again" in done.stderr
     assert told == (goes_on_from == "lines" and packets > frame)
     assert (tmp_path / "stream.gss").read_bytes() == undisturbed
-    if goes_on_from == "lines":
-        assert [line["frame"] for line in metrics(tmp_path)] == list(range(6))
+    assert [line["frame"] for line in metrics(tmp_path)] == list(range(6))
 
 
 def test_no_latency_contains_its_own_refinement_but_the_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,8 +11,8 @@ import torch
 
 from gsstream.core.frame import Frame
 from gsstream.core.shapes import FloatArray
-from gsstream.method.base import MethodState
 from gsstream.metrics import changed_mask, moving_mask, noise_sigma, psnr, ssim
+from gsstream.packet import PlayerState
 from gsstream.parts.render.base import Renderer
 
 #: Held-out PSNR of frame 0 below which training views are looked at, and how far it may lie below theirs, dB.
@@ -33,7 +33,7 @@ class HeldOut:
         self._first: Frame | None = None
         self._sigma: list[float] = []
 
-    def measure(self, state: MethodState, frame: Frame) -> dict[str, Any]:
+    def measure(self, player: PlayerState, frame: Frame) -> dict[str, Any]:
         """Return PSNR, SSIM and PSNR of moving and changed pixels by test camera; None where undefined."""
         if self._first is None:
             self._first = frame
@@ -41,7 +41,7 @@ class HeldOut:
             self._sigma = _noise(self._first, frame)
         out: dict[str, Any] = {"psnr": {}, "ssim": {}, "psnr_moving": {}, "psnr_changed": {}}
         for view, name in enumerate(frame.cameras.ids):
-            image = self.render(state, frame, view)
+            image = self.render(player, frame, view)
             truth, first = frame.image(view), self._first.image(view)
             out["psnr"][name] = _finite(psnr(image, truth))
             out["ssim"][name] = _finite(ssim(image, truth))
@@ -49,13 +49,13 @@ class HeldOut:
             out["psnr_changed"][name] = _finite(psnr(image, truth, changed_mask(truth, first)))
         return out
 
-    def doubt(self, state: MethodState, train: Frame, measured: Mapping[str, float | None]) -> str:
+    def doubt(self, player: PlayerState, train: Frame, measured: Mapping[str, float | None]) -> str:
         """Say in a line when frame 0 shows the training cameras what they saw and the held-out ones something else."""
         held_out = [value for value in measured.values() if value is not None]
         if not held_out or float(np.mean(held_out)) >= LOW_PSNR_DB:
             return ""
         views = np.unique(np.linspace(0, len(train.cameras) - 1, MAX_TRAIN_VIEWS).round().astype(int))
-        seen = float(np.mean([psnr(self.render(state, train, int(view)), train.image(view)) for view in views]))
+        seen = float(np.mean([psnr(self.render(player, train, int(view)), train.image(view)) for view in views]))
         below = seen - float(np.mean(held_out))
         if below < MAX_DROP_DB:
             return ""
@@ -70,9 +70,9 @@ class HeldOut:
         if second is not None:
             self._sigma = _noise(first, second)
 
-    def render(self, state: MethodState, frame: Frame, view: int) -> FloatArray:
+    def render(self, player: PlayerState, frame: Frame, view: int) -> FloatArray:
         """Return the decoded image [H, W, 3] of a camera, in [0, 1]."""
-        gaussians, background = state.player.gaussians.map(torch.from_numpy), state.player.meta.background
+        gaussians, background = player.gaussians.map(torch.from_numpy), player.meta.background
         with torch.no_grad():
             output = self._renderer.render(gaussians, frame.cameras, view, background)
         return np.asarray(np.clip(output.image.numpy(), 0, 1))

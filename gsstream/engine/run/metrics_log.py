@@ -6,7 +6,7 @@ import errno
 import itertools
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -48,18 +48,19 @@ def trim_metrics(path: Path, last: int) -> list[dict[str, Any]]:
     """Drop the lines of frames that the stream does not hold (a kill came between), and return those kept."""
     kept = [line for line in _written(path) if int(line["frame"]) <= last]
     if path.exists():
-        write_whole(path, "".join(json.dumps(line) + "\n" for line in kept))
+        add_metrics(path, kept, [])
     return kept
 
 
 def append_metrics(path: Path, line: dict[str, Any]) -> None:
-    """Add the record of one frame, in one write. Raises OutputError when there is no room for it.
+    """Add the record of one frame, in one write. Raises OutputError when there is no room for it, or no file.
 
-    A line that was only written in part is taken back, so that what follows does not stand behind half of one.
+    A run makes the file when it begins: one that is gone since has taken the lines of earlier frames with it. A line
+    that was only written in part is taken back, so that what follows does not stand behind half of one.
     """
     data = (json.dumps(line) + "\n").encode()
-    with disk_errors(path.parent), path.open("ab", buffering=0) as log:
-        before = log.tell()
+    with disk_errors(path.parent), path.open("r+b", buffering=0) as log:
+        before = log.seek(0, os.SEEK_END)
         try:
             written = log.write(data)
         except OSError:
@@ -68,6 +69,12 @@ def append_metrics(path: Path, line: dict[str, Any]) -> None:
         if written != len(data):
             log.truncate(before)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+
+def add_metrics(path: Path, kept: list[dict[str, Any]], lines: Iterable[dict[str, Any]]) -> None:
+    """Write the lines that are kept and more of them, in the order of frames; a kill leaves the file as it was."""
+    found = sorted([*kept, *lines], key=lambda line: int(line["frame"]))
+    write_whole(path, "".join(json.dumps(line) + "\n" for line in found))
 
 
 def _written(path: Path) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +22,8 @@ from gsstream.engine.run.encoder import Callbacks, Encoder
 from gsstream.engine.run.few_cameras import expectation, first_frame_summary
 from gsstream.engine.run.live import live_metrics
 from gsstream.engine.run.measure import HeldOut
-from gsstream.engine.run.metrics_log import append_metrics, last_written, trim_metrics
+from gsstream.engine.run.measured_again import measure_again
+from gsstream.engine.run.metrics_log import add_metrics, append_metrics, last_written, trim_metrics
 from gsstream.engine.run.progress import RunProgress
 from gsstream.input.recordings.base import AdaptiveSource, FrameSource, LiveSource, SourceInfo
 from gsstream.input.recordings.prefetch import Prefetcher
@@ -132,6 +133,8 @@ class _Run:
         """Go on after what the folder holds, or write the recipe into it; return the first frame to encode."""
         last = self._resume() if resume else None
         if last is None:
+            # Before the first packet: a packet without this file would be one that nobody misses a line of.
+            (self.out / METRICS).touch()
             save_resolved(self.out / RECIPE, self.encoder.assembly.resolved)
             if sentence := expectation(self.source.info.train):
                 self.progress.say(sentence)
@@ -146,9 +149,9 @@ class _Run:
         # A run that is behind does not spend time on the quality of frames that it drops: ``evaluate`` measures it.
         dropped = metrics["live"] is not None and metrics["live"]["policy"] == "dropped"
         if self.held_out and len(test.cameras) and not dropped:
-            metrics |= self.held_out.measure(step.state, self.encoder.with_near_plane(test))
+            metrics |= self.held_out.measure(step.state.player, self.encoder.with_near_plane(test))
             if train.index == 0:
-                doubt = self.held_out.doubt(step.state, self.encoder.with_near_plane(train), metrics["psnr"])
+                doubt = self.held_out.doubt(step.state.player, self.encoder.with_near_plane(train), metrics["psnr"])
                 if doubt:
                     warnings.warn(f"{doubt}: see 'gsstream scene validate {self.source.info.uri}'", stacklevel=2)
         append_metrics(self.out / METRICS, metrics)
@@ -173,15 +176,34 @@ class _Run:
         stream, log = self.out / STREAM, self.out / METRICS
         planned = self.encoder.controller.budget.limits_frames
         # A kill between a packet and its line leaves a frame that no table would count, and that a budget would plan
-        # without: such frames are encoded again, to the same bytes. A run without any line goes on from its packets.
-        wanted = last_written(log) if planned or log.exists() else None
+        # without. A later frame is encoded again, to the same bytes: it costs little, and its line tells everything.
+        # Frame 0 may cost as much as all later ones, and a log that is gone the whole run: they are measured again.
+        wanted: int | None = last_written(log)
+        if not planned and wanted == -1:
+            wanted = None
         last = self.encoder.resume(stream, lambda index: self.source.frame(index, "train"), wanted)
         if wanted is not None:
             _warn_lost_lines(stream, -1 if last is None else last)
-        self.encoder.controller.remember(trim_metrics(log, -1 if last is None else last))
+        kept = trim_metrics(log, -1 if last is None else last)
+        self.encoder.controller.remember(kept)
         if last is None and wanted is not None:
             stream.unlink()  # it may hold sound packets of frames that are made again
+        if last is not None and wanted is None:
+            self._measure_again(kept, last)
         return last
+
+    def _measure_again(self, kept: list[dict[str, Any]], last: int) -> None:
+        """Write the lines that the packets up to ``last`` lack."""
+        known = {int(line["frame"]) for line in kept}
+        missing = [frame for frame in range(last + 1) if frame not in known]
+        warnings.warn(
+            f"{METRICS} has no line of {_frames(missing)}, though {STREAM} has the packets: the decoded frames are "
+            "measured again; what they cost is lost",
+            stacklevel=2,
+        )
+        self._restore_metrics(last + 1)
+        lines = measure_again(self.out / STREAM, missing, self.source, encoder=self.encoder, held_out=self.held_out)
+        add_metrics(self.out / METRICS, kept, lines)
 
     def _restore_metrics(self, done: int) -> None:
         """What the frames before ``done``, which are not made here, say about noise and about what moves."""
@@ -197,12 +219,16 @@ def _warn_lost_lines(stream: Path, last: int) -> None:
     with StreamReader(stream) as reader:
         held = [entry.frame for entry in reader.frames if entry.frame > last]
     if held:
-        frames = f"frame {held[0]}" if len(held) == 1 else f"frames {held[0]} to {held[-1]}"
         warnings.warn(
-            f"{METRICS} has no line of frame {held[0]}, though {stream.name} has its packet: {frames} of the stream "
-            f"{'is' if len(held) == 1 else 'are'} made again",
+            f"{METRICS} has no line of frame {held[0]}, though {stream.name} has its packet: {_frames(held)} of the "
+            f"stream {'is' if len(held) == 1 else 'are'} made again",
             stacklevel=2,
         )
+
+
+def _frames(indices: Sequence[int]) -> str:
+    """Name frames in the order of their indices."""
+    return f"frame {indices[0]}" if len(indices) == 1 else f"frames {indices[0]} to {indices[-1]}"
 
 
 def _num_frames(info: SourceInfo, wanted: int | None) -> int | None:

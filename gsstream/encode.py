@@ -38,12 +38,12 @@ from gsstream.engine.assembly.assemble import Assembly as Assembly
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.encoder import Callbacks as Callbacks
+from gsstream.engine.run.encoder import EncodedFrame as EncodedFrame
 from gsstream.engine.run.encoder import Encoder as Encoder
 from gsstream.engine.run.recording import open_recording as _open
 from gsstream.input.recordings.base import FrameSource as FrameSource
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.input.recordings.canonical import CanonicalSource, recording_similarity
-from gsstream.method.base import Step as Step
 from gsstream.method.base import StreamingMethod
 from gsstream.packet import StreamWriter as StreamWriter
 from gsstream.parts.confidence.base import ConfidenceEstimator
@@ -62,8 +62,8 @@ if TYPE_CHECKING:
     from gsstream.discovery.catalog import Catalog
 
 __all__ = [
-    "Assembly", "Callbacks", "Cameras", "Encoder", "Frame", "FrameSource", "Parts", "Recipe", "Step", "StreamWriter",
-    "encode", "encoder_for", "encoder_for_rig", "open_recording", "recipe_for", "to_rig_coordinates",
+    "Assembly", "Callbacks", "Cameras", "EncodedFrame", "Encoder", "Frame", "FrameSource", "Parts", "Recipe",
+    "StreamWriter", "encode", "encoder_for", "encoder_for_rig", "open_recording", "recipe_for", "to_rig_coordinates",
 ]  # fmt: skip
 
 

@@ -30,7 +30,7 @@ def gsstream_components() -> list[ComponentSpec]:
         _part(
             "streaming_method",
             "parts",
-            "engine.method.parts:PartsMethod",
+            "engine.run.parts_method:PartsMethod",
             "the slots of the recipe, one after the other",
         ),
         _part("streaming_method", "hold", "method.static:Hold", "frame 0 and nothing after it"),

@@ -1,15 +1,15 @@
 """StreamingMethod: the one interface to a method. What it sends is played by every player.
 
 A method is given a frame and what the engine can do (``Tools``), and returns a packet and the state it goes on from.
-The engine keeps the rest: recordings, recipes, the stream on disk, metrics, resume. ``engine.method.parts.PartsMethod``
-is the method made of parts; QUEEN is another one, built differently.
+The engine keeps the rest: recordings, recipes, the stream on disk, metrics, resume. The method made of parts is
+``engine.run.parts_method.PartsMethod``; QUEEN is another one, built differently.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar, final
 
@@ -41,17 +41,17 @@ State = TypeVar("State", bound=MethodState)
 class Step(Generic[State]):
     """Outcome of one frame: (state, frame) -> Step. Nothing is mutated, so a failed frame costs nothing.
 
+    What the frame cost is written to ``tools.log``.
+
     Arguments:
         state: what the next frame starts from.
         packet: what is written.
         status: kind of the packet.
-        metrics: the frame's line of ``metrics.jsonl``, which the encoder fills in; a method writes to ``tools.log``.
     """
 
     state: State
     packet: EncodedPacket
     status: Literal["key", "delta", "empty"]
-    metrics: Mapping[str, Any] = field(default_factory=dict)
 
 
 class StreamingMethod(Part, Generic[State]):

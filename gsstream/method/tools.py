@@ -12,6 +12,7 @@ from gsstream.core.changes import Layout
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.log import FrameLog
 from gsstream.core.shapes import FloatArray
+from gsstream.method.budget import FrameBudget
 from gsstream.packet import PlayerState, StreamMeta
 from gsstream.parts.render.work import FitContext
 
@@ -60,29 +61,6 @@ class FrameTools(FitContext, Protocol):
         """
 
 
-class FrameBudget(Protocol):
-    """What one frame may cost. A packet beyond ``max_bytes`` is sent and counted as a violation."""
-
-    @property
-    def max_bytes(self) -> int | None:
-        """Bytes of the packet, headers included; None: no limit."""
-
-    @property
-    def epochs(self) -> int:
-        """Epochs that are planned for the frame; with a limit on time a prediction."""
-
-    @property
-    def step_scale(self) -> float:
-        """Factor on quantisation steps, at least 1."""
-
-    @property
-    def part_scale(self) -> float:
-        """Share of their usual passes that motion and growth make, above 0 to 1."""
-
-    def seconds_left(self) -> float | None:
-        """Return the seconds until the frame should be over, by the budget's clock; None: no limit."""
-
-
 class Tools(Protocol):
     """What a method may use, the one made of parts included. Only ``log`` is written to, and it ends with the frame."""
 
@@ -105,8 +83,8 @@ class Tools(Protocol):
         """Frame 0 of another stream, to be taken over; None: frame 0 is to be reconstructed."""
 
     @property
-    def budget(self) -> FrameBudget | None:
-        """What this frame may cost; None: no limit."""
+    def budget(self) -> FrameBudget:
+        """What this frame may cost; its limits are None where the recipe sets none, and in frame 0."""
 
     def epochs(self, frame: Frame) -> int:
         """Return how many epochs (iterations of every training camera) a later frame is worth.

@@ -12,10 +12,10 @@ from gsstream.core.frame import Frame
 from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.frame0.points import gather_points
-from gsstream.engine.method.checked import difference_between
-from gsstream.engine.run.encoder import Encoder
+from gsstream.engine.run.encoder import EncodedFrame, Encoder
+from gsstream.engine.run.player_difference import difference_between
 from gsstream.input.recordings.open import open_source
-from gsstream.method.base import Step, StreamingMethod
+from gsstream.method.base import StreamingMethod
 from gsstream.packet import PlayerState, decode_packet
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import ComponentRef
@@ -74,15 +74,15 @@ class MethodUnderTest:
         )
         return encoder
 
-    def begin(self, frame: Frame, uri: str = SOURCE) -> Step[Any]:
+    def begin(self, frame: Frame, uri: str = SOURCE) -> EncodedFrame:
         """Make frame 0."""
         return self.encoder(uri).encode(frame)
 
-    def take_over(self, first: PlayerState, frame: Frame) -> Step[Any]:
+    def take_over(self, first: PlayerState, frame: Frame) -> EncodedFrame:
         """Make frame 0 from that of another stream."""
         return self.encoder(first=first).encode(frame)
 
-    def step(self, state: Any, frame: Frame) -> Step[Any]:
+    def step(self, state: Any, frame: Frame) -> EncodedFrame:
         """Make a later frame."""
         encoder = self.encoder()
         encoder.state = state
@@ -98,7 +98,7 @@ class MethodUnderTest:
         """Do what a player does with a packet."""
         return decode_packet(state, data)
 
-    def chain(self, uri: str = SOURCE, choose: Callable[[Frame], Frame] | None = None) -> list[Step[Any]]:
+    def chain(self, uri: str = SOURCE, choose: Callable[[Frame], Frame] | None = None) -> list[EncodedFrame]:
         """Make all frames of a recording."""
         source = open_source(uri)
         frames = [source.frame(index) for index in range(FRAMES)]
@@ -109,7 +109,7 @@ class MethodUnderTest:
         return steps
 
     @functools.cached_property
-    def steps(self) -> list[Step[Any]]:
+    def steps(self) -> list[EncodedFrame]:
         """The chain that most checks look at, encoded once."""
         return self.chain()
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,8 +13,8 @@ from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray, check_finite
+from gsstream.engine.run.encoder import EncodedFrame
 from gsstream.input.recordings.open import open_source
-from gsstream.method.base import Step
 from gsstream.packet import StreamWriter, quantise_key
 from gsstream.testing.cases import fingerprint
 from gsstream.testing.method_driver import FRAMES, SOURCE, MethodUnderTest, check_replay
@@ -24,7 +23,7 @@ from gsstream.testing.registry import check
 CUT = 2
 
 
-def _bytes(what: str, got: Step[Any], expected: Step[Any]) -> None:
+def _bytes(what: str, got: EncodedFrame, expected: EncodedFrame) -> None:
     a, b = got.packet.data, expected.packet.data
     if a == b:
         return
@@ -119,7 +118,7 @@ def check_method_declared_needs(method: MethodUnderTest) -> None:
 def check_method_size_is_true(method: MethodUnderTest) -> None:
     """Reported bytes are the bytes written, and no more Gaussians change or gates are open than there are."""
     for step in method.steps:
-        metrics: Any = step.metrics
+        metrics = step.metrics
         total = sum(metrics["bytes"].values())
         frame = step.packet.frame
         assert total == len(step.packet.data), f"frame {frame}: says {total} bytes, wrote {len(step.packet.data)}"

@@ -13,10 +13,10 @@ from gsstream.core.changes import Scene
 from gsstream.core.log import FrameLog
 from gsstream.core.part import Part
 from gsstream.core.rng import Rng
+from gsstream.engine.run.encoder import EncodedFrame
 from gsstream.engine.step.active.change import Change, detect_changed_tiles
 from gsstream.engine.step.context import EngineContext
 from gsstream.input.recordings.open import open_source
-from gsstream.method.base import Step
 from gsstream.metrics.psnr import psnr
 from gsstream.player.render import named_renderer, render
 from gsstream.testing.method_driver import FRAMES, SOURCE, MethodUnderTest, check_replay
@@ -36,7 +36,7 @@ class FitFixture(NamedTuple):
 
 
 @functools.lru_cache(maxsize=1)
-def _before() -> tuple[MethodUnderTest, Step[Any]]:
+def _before() -> tuple[MethodUnderTest, EncodedFrame]:
     """A dense method, and its step of frame 1: some rows were displaced."""
     method = MethodUnderTest("dense")
     return method, method.chain()[1]

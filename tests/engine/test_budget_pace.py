@@ -9,9 +9,9 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from gsstream.engine.budget.epoch_scheduler import Allowance, EpochScheduler
-from gsstream.engine.budget.plan import MAX_TRIMMED, TIME_MARGIN, UNKNOWN_RESERVE, FramePlan, Past, plan
-from gsstream.engine.budget.schedule import Schedule
+from gsstream.engine.budget.epoch_scheduler import EpochScheduler
+from gsstream.engine.budget.plan import MAX_TRIMMED, TIME_MARGIN, UNKNOWN_RESERVE, Past, plan, unlimited
+from gsstream.method.budget import FrameBudget
 from gsstream.recipe.budget import Budget
 from gsstream.recipe.model import Stream
 
@@ -26,104 +26,109 @@ class Clock:
         return self.now
 
 
-def paced(seconds: float, effort: float = 1.0, before: float = 0.0, **known: float) -> tuple[EpochScheduler, Clock]:
+VIEWS = 5
+
+
+def paced(
+    seconds: float, effort: float = 1.0, before: float = 0.0, now: int = 10, **known: float
+) -> tuple[EpochScheduler, Clock]:
     clock = Clock()
     began = clock.now
     clock.now += before
     values = {"after": 1.0, "each": 0.55, **known}
-    found = FramePlan(20, 6.0, 3e-4, max_epochs=30, seconds=seconds, **values)  # type: ignore[arg-type]
-    return EpochScheduler(Allowance(found, began, clock), max(1, round(effort * 20)), 3e-4, 5, effort), clock
+    budget = FrameBudget(20, 6.0, 3e-4, max_epochs=30, seconds=seconds, started=began, clock=clock, **values)  # type: ignore[arg-type]
+    return EpochScheduler(budget, VIEWS, now, effort), clock
+
+
+def views_made(pace: EpochScheduler, clock: Clock, *seconds: float) -> int:
+    """How many views a frame makes whose views take so many seconds, the last of them from then on."""
+    made = 0
+    while pace.goes_on:
+        for piece in pace.next_pass(range(VIEWS)):
+            assert len(piece) == 1, "the clock is read after every view"
+            clock.now += seconds[min(made, len(seconds) - 1)]
+            made += 1
+    return made
 
 
 def test_the_clock_ends_a_frame_before_its_coding_has_no_time_left() -> None:
     pace, clock = paced(5.0)
-    pace.start(10)
-    done = 0
-    while True:
-        clock.now += 0.3
-        done += 1
-        if pace.is_over():
-            break
-    assert done == 13, "4 seconds are there beside coding, and 13 views of 0.3 s fit into them"
+    assert views_made(pace, clock, 0.3) == 13, "4 seconds are there beside coding, and 13 views of 0.3 s fit into them"
     assert pace.stopped_by_clock
+    assert pace.is_cut
+    assert pace.done == 2, "the third pass was not made to its end"
+    assert pace.optimise == pytest.approx(13 * 0.3)
 
 
 @pytest.mark.parametrize(("effort", "views"), [(1.0, 33), (0.5, 16), (0.2, 6), (0.01, 1)])
 def test_a_hurried_frame_takes_its_share_of_the_time_that_passes_have(effort: float, views: int) -> None:
     """Its run is behind: time that the deadline leaves is for the frames that wait."""
     pace, clock = paced(13.0, effort, before=2.0)
-    pace.start(10)
-    done, over = 0, False
-    while not over and done < 100:
-        clock.now += 0.3
-        done += 1
-        over = pace.is_over()
-    assert done == views, "of 13 seconds 2 were before the passes and 1 is kept for what follows them"
+    assert views_made(pace, clock, 0.3) == views, "of 13 seconds 2 were before the passes and 1 is kept for the rest"
 
 
 def test_a_hurried_frame_that_has_no_time_left_is_not_given_more() -> None:
     pace, clock = paced(2.0, 0.2, before=5.0)
-    pace.start(10)
-    clock.now += 0.3
-    assert pace.is_over()
+    assert views_made(pace, clock, 0.3) == 1
 
 
 def test_passes_follow_what_they_took() -> None:
     pace, clock = paced(11.0)
-    pace.start(10)
     assert pace.epochs == 18, "10 s, 0.55 s a pass in the frames before"
-    for done, seconds, planned in ((1, 2.0, 5), (2, 1.0, 9), (3, 6.8, 3)):
-        for _ in range(5):
-            clock.now += seconds / 5
-            pace.is_over()
-        pace.end_epoch(done)
+    for done, seconds, planned in ((1, 2.0, 5), (2, 1.0, 9), (3, 5.74, 3)):
+        for _ in pace.next_pass(range(VIEWS)):
+            clock.now += seconds / VIEWS
+        assert pace.done == done
         assert pace.epochs == planned, "what is left, at what the last pass took"
-    assert pace.stopped_by_clock
+    assert pace.stopped_by_clock, "a view would fit into what is left, and a quarter of a pass would not"
+    assert not pace.goes_on
 
 
 def test_the_first_number_of_passes_scales_with_the_candidates() -> None:
-    few, many = (paced(11.0, each=1.0, candidates=100)[0] for _ in range(2))
-    few.start(100)
-    many.start(400)
-    assert (few.epochs, many.epochs) == (10, 3)
+    assert [paced(11.0, now=now, each=1.0, candidates=100)[0].epochs for now in (100, 400)] == [10, 3]
 
 
-def test_without_an_allowance_nothing_changes() -> None:
-    schedule = Schedule(7, 3e-4)
-    schedule.start(10)
-    schedule.end_epoch(1)
-    schedule.weigh_bytes(1, lambda: pytest.fail("no size is to be met"))
-    schedule.finish()
-    assert (schedule.is_over(), schedule.epochs, schedule.rd_lambda, schedule.chunk) == (False, 7, 3e-4, None)
+def test_without_a_limit_nothing_changes() -> None:
+    stream = Stream(epochs=7, rd_lambda=3e-4)
+    schedule = EpochScheduler(unlimited(stream), VIEWS, 10)
+    pieces = []
+    while schedule.goes_on:
+        pieces += list(schedule.next_pass([2, 0, 4, 1, 3]))
+        schedule.weigh_bytes(lambda: pytest.fail("no size is to be met"))
+    assert pieces == 7 * [[2, 0, 4, 1, 3]], "the clock is not asked within a pass"
+    assert (schedule.epochs, schedule.rd_lambda, schedule.stopped_by_clock) == (7, 3e-4, False)
+    assert [EpochScheduler(unlimited(stream), VIEWS, 10, scale).epochs for scale in (0.5, 0.01)] == [4, 1]
+
+
+def sized() -> EpochScheduler:
+    return EpochScheduler(FrameBudget(4, 6.0, 1e-3, max_bytes=1000), VIEWS, 10)
+
+
+def make_pass(pace: EpochScheduler) -> None:
+    assert len(list(pace.next_pass(range(VIEWS)))) == 1, "bytes are weighed between passes"
 
 
 def test_the_weight_of_a_frame_is_that_of_its_last_half() -> None:
-    clock = Clock()
-    pace = EpochScheduler(Allowance(FramePlan(4, 6.0, 1e-3, max_bytes=1000), clock.now, clock), 4, 1e-3, 5)
-    for done in range(1, 5):
-        pace.end_epoch(done)
-        pace.weigh_bytes(done, lambda: 10 * MAX_TRIMMED * 1000)
+    pace = sized()
+    for _ in range(4):
+        make_pass(pace)
+        pace.weigh_bytes(lambda: 10 * MAX_TRIMMED * 1000)
     # Made with 1e-3 (its pass is a quarter of all: looked at), then three times as much after each pass.
     assert pace.mean_rate_weight == pytest.approx(math.sqrt(9e-3 * 27e-3))
 
 
 @pytest.mark.parametrize(("estimate", "after"), [(900, 1e-3), (1000, 1e-3), (1999, 1e-3), (4000, 2e-3), (235, 5e-4)])
 def test_up_to_twice_the_size_is_left_to_trimming(estimate: float, after: float) -> None:
-    clock = Clock()
-    pace = EpochScheduler(Allowance(FramePlan(4, 6.0, 1e-3, max_bytes=1000), clock.now, clock), 4, 1e-3, 5)
-    pace.weigh_bytes(2, lambda: estimate)
+    pace = sized()
+    make_pass(pace)
+    make_pass(pace)
+    pace.weigh_bytes(lambda: estimate)
     assert pace.rd_lambda == pytest.approx(after, rel=0.03)
 
 
 def test_a_slow_first_view_does_not_end_the_frame() -> None:
     pace, clock = paced(5.0)
-    pace.start(10)
-    clock.now += 2.5
-    assert not pace.is_over(), "1.5 s are left, and the next view will not take as long"
-    clock.now += 0.4
-    assert not pace.is_over()
-    clock.now += 0.8
-    assert pace.is_over()
+    assert views_made(pace, clock, 2.5, 0.4, 0.8) == 3, "1.5 s were left after the first, and no other takes as long"
 
 
 @dataclass(frozen=True)
@@ -151,29 +156,20 @@ class Made:
     planned: tuple[int, ...]
 
 
-def made(found: FramePlan, costs: Costs, slower: float = 1.0) -> Made:
+def made(found: FrameBudget, costs: Costs, slower: float = 1.0) -> Made:
     """A frame whose passes take what they take, as ``optimise`` goes through them."""
     clock = Clock()
     began = clock.now
-    pace = EpochScheduler(Allowance(found, began, clock), found.epochs, 3e-4, costs.views)
     clock.now += costs.before
-    pace.start(100)
-    epoch, planned = 0, [pace.epochs]
-    iterations = 0
-    while epoch < pace.epochs:
-        for _ in range(costs.views):
-            clock.now += costs.view * slower**epoch + (costs.first if iterations == 0 else 0.0)
+    pace = EpochScheduler(replace(found, started=began, clock=clock), costs.views, 100)
+    planned, iterations = [pace.epochs], 0
+    while pace.goes_on:
+        for _ in pace.next_pass(range(costs.views)):
+            if iterations:
+                planned.append(pace.epochs)
+            clock.now += costs.view * slower**pace.done + (costs.first if iterations == 0 else 0.0)
             iterations += 1
-            if pace.is_over():
-                break
-            planned.append(pace.epochs)
-        else:
-            epoch += 1
-            pace.end_epoch(epoch)
-            continue
-        break
-    optimised = clock.now - began - costs.before
-    return Made(clock.now - began + costs.after, optimised, iterations / costs.views, tuple(planned))
+    return Made(clock.now - began + costs.after, pace.optimise, iterations / costs.views, tuple(planned))
 
 
 def past(frame: Made, costs: Costs) -> Past:

@@ -15,19 +15,19 @@ from gsstream.core import log as log_module
 from gsstream.core.errors import RecipeError
 from gsstream.core.log import FrameLog
 from gsstream.engine.budget.controller import Controller, spent
-from gsstream.engine.budget.epoch_scheduler import Allowance, estimated_bytes, next_rate_weight
+from gsstream.engine.budget.epoch_scheduler import estimated_bytes, next_rate_weight
 from gsstream.engine.budget.plan import (
     MAX_WEIGHT,
     MIN_PART_SCALE,
     MIN_WEIGHT,
     TIME_MARGIN,
-    FramePlan,
     Past,
     epochs_in,
     plan,
 )
 from gsstream.engine.budget.report import budget_lines
 from gsstream.method.base import Step
+from gsstream.method.budget import FrameBudget
 from gsstream.packet import encode_empty
 from gsstream.packet.symbols import encode_symbols
 from gsstream.recipe.budget import Budget, budget_overrides
@@ -219,19 +219,21 @@ class Clock:
         self.seconds = 0.0
         monkeypatch.setattr(log_module.time, "perf_counter", lambda: self.seconds)
 
-    def settled(self, controller: Controller, frame: int, size: int, seconds: float, status: str = "delta") -> FrameLog:
+    def settled(self, controller: Controller, frame: int, size: int, seconds: float, first: bool = False) -> FrameLog:
         """Return the log of a frame of so many bytes and seconds, after the controller has settled it."""
         log = FrameLog()
+        allowed = controller.allow(log, first)
         log.set(bytes={"all": size}, num_gaussians=10, candidate_gaussians=5)
         with log.phase("code"):
             self.seconds += seconds
-        controller.settle(frame, status, log)
+        packet = replace(encode_empty(frame=frame), data=bytes(size))
+        controller.settle(Step(None, packet, "key" if first else "delta"), allowed, 3, log)
         return log
 
 
 def test_violations_are_written_down_and_summed_up(monkeypatch: pytest.MonkeyPatch) -> None:
     controller, clock = Controller(Budget(size=1000, time=2.0), Stream()), Clock(monkeypatch)
-    logs = [clock.settled(controller, 0, 99_000, 90.0, "key")]
+    logs = [clock.settled(controller, 0, 99_000, 90.0, first=True)]
     logs += [clock.settled(controller, t, 990 + 10 * t, 1.5 + 0.5 * (t == 3)) for t in range(1, 4)]
     lines = [{"frame": frame, **log.entry()} for frame, log in enumerate(logs)]
     assert [entry["budget"]["violated"] for entry in lines] == [[], [], ["size"], ["size"]]
@@ -244,12 +246,12 @@ def test_violations_are_written_down_and_summed_up(monkeypatch: pytest.MonkeyPat
 
 
 def test_fewer_passes_of_motion_and_growth_are_written_down_and_summed_up() -> None:
-    planned = FramePlan(epochs=1, change_threshold=0.0, rd_lambda=0.0, seconds=1.0, part_scale=0.4)
+    planned = FrameBudget(epochs=1, change_threshold=0.0, rd_lambda=0.0, seconds=1.0, part_scale=0.4)
     used = {
         "rd_lambda": 0.0, "estimate": 0.0, "stopped_by_clock": True, "untrimmed": 9, "dropped": {}, "before": 0.5,
         "optimise": 0.0, "parts": 0.8,
     }  # fmt: skip
-    entry = spent(Allowance.start(planned), used, Stream(epochs=1), 1.0)
+    entry = spent(planned, used, Stream(epochs=1), 1.0)
     assert entry["reduced"] == {"part_scale": 0.4}
     assert entry["binding"] == ["time"], "once, though the clock stopped the passes of the residual, too"
     line = {"frame": 1, "budget": {**entry, "limits": {"time": 1.0}, "actual": {"time": 0.9}, "violated": []}}
@@ -260,15 +262,15 @@ def test_a_key_packet_waits_until_it_can_be_paid(monkeypatch: pytest.MonkeyPatch
     clock = Clock(monkeypatch)
 
     def refusal(controller: Controller, number: int) -> str | None:
-        return controller.key_refusal(number, controller.allow(FrameLog()))
+        return controller.key_refusal(controller.allow(FrameLog()), number)
 
     controller = Controller(Budget(size=1000), Stream())
     assert refusal(controller, 10) is None, "nothing is known yet"
-    clock.settled(controller, 0, 5000, 1.0, "key")
+    clock.settled(controller, 0, 5000, 1.0, first=True)
     assert refusal(controller, 10) == "about 5000 bytes where 1000 are allowed"
     assert refusal(controller, 1) is None
     slow = Controller(Budget(time=0.5), Stream())
-    clock.settled(slow, 0, 5000, 1.0, "key")
+    clock.settled(slow, 0, 5000, 1.0, first=True)
     assert "where 0.5 s are allowed" in str(refusal(slow, 10))
 
 
@@ -278,15 +280,15 @@ def test_a_method_that_logs_no_use_of_its_budget_is_described_by_its_phases(
 ) -> None:
     controller, clock, log = Controller(Budget(size=1000, time=9.0), Stream()), Clock(monkeypatch), FrameLog()
     budget = controller.allow(log)
-    assert budget is not None
     for phase, seconds in (("motion", 1.0), ("optimise", 4.0), ("code", 0.5)):
         with log.phase(phase):
             clock.seconds += seconds
     if logged:
         log.set(iterations=6)
     packet = encode_empty(frame=1)
-    controller.describe(budget, Step(None, packet, "empty"), 3, log)
-    assert ("budget" in log.numbers) == logged, "a frame without iterations says nothing of what epochs cost"
+    log.set(bytes={"header": len(packet.data)}, num_gaussians=10)
+    controller.settle(Step(None, packet, "empty"), budget, 3, log)
+    assert ("usage" in log.numbers["budget"]) == logged, "a frame without iterations says nothing of what epochs cost"
     if logged:
         usage = log.numbers["budget"]["usage"]
         assert (usage["epochs"], usage["seconds_before"], usage["seconds_optimise"]) == (2, 1.0, 4.0)

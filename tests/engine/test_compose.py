@@ -15,7 +15,7 @@ from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.discovery.catalog import load_catalog
 from gsstream.encode import Encoder, encoder_for, encoder_for_rig, open_recording
 from gsstream.engine.assembly.assemble import with_live
-from gsstream.engine.method.parts import PartsMethod
+from gsstream.engine.run.parts_method import PartsMethod
 from gsstream.method.static import Hold
 from gsstream.parts.motion.none import Still
 from gsstream.parts.motion.rigid import Rigid

@@ -27,7 +27,7 @@ from gsstream.core.frame import Frame
 from gsstream.encode import Callbacks, Cameras, Encoder, encoder_for, encoder_for_rig, open_recording
 from gsstream.engine.frame0.begin import decoded_anchors
 from gsstream.engine.keys.resume import rebuild_hierarchy
-from gsstream.method.base import Step
+from gsstream.engine.run.encoder import EncodedFrame
 from gsstream.packet import PacketKind, StreamReader, StreamWriter, decode_packet
 from gsstream.play import Playback
 
@@ -89,18 +89,18 @@ def encoder(case: str = "still", listeners: Callbacks | None = None) -> Encoder:
 
 
 @cache
-def whole(case: str) -> tuple[Step[Any], ...]:
+def whole(case: str) -> tuple[EncodedFrame, ...]:
     """The steps of an undisturbed encoder."""
     made = encoder(case)
     with early(case):
         return tuple(made.encode(frame) for frame in frames())
 
 
-def packets(steps: tuple[Step[Any], ...] | list[Step[Any]]) -> list[bytes]:
+def packets(steps: tuple[EncodedFrame, ...] | list[EncodedFrame]) -> list[bytes]:
     return [step.packet.data for step in steps]
 
 
-def write(path: Path, steps: tuple[Step[Any], ...]) -> Path:
+def write(path: Path, steps: tuple[EncodedFrame, ...]) -> Path:
     with StreamWriter.open(path) as writer:
         for step in steps:
             writer.append(step.packet)

@@ -25,7 +25,7 @@ from gsstream.core.part import unwrapped
 from gsstream.encode import Encoder, encoder_for, open_recording
 from gsstream.engine.assembly.fault import Where
 from gsstream.engine.assembly.guard import Guarded, guard
-from gsstream.engine.method.wrapped import RepeatedFrameWarning
+from gsstream.engine.run.run_frame import RepeatedFrameWarning
 from gsstream.engine.step import frame_step as step_module
 from gsstream.packet import decode_packet
 from gsstream.parts.gate.always_open import AlwaysOpen

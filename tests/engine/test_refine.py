@@ -23,10 +23,10 @@ from gsstream.engine.frame0 import refine
 from gsstream.engine.frame0.axes import nearest_axes
 from gsstream.engine.frame0.refine import track_motion
 from gsstream.engine.keys import keyframes
-from gsstream.engine.method.wrapped import SkippedWorkWarning
+from gsstream.engine.run.encoder import EncodedFrame
 from gsstream.engine.run.measure import HeldOut
+from gsstream.engine.run.run_frame import SkippedWorkWarning
 from gsstream.engine.state.stream_state import Refinement
-from gsstream.method.base import Step
 from gsstream.packet import PlayerState, quantise_key
 from gsstream.parts.render.activations import rotation_matrices
 
@@ -50,13 +50,13 @@ def encoder(**settings: Any) -> Encoder:
         return encoder_for("s2gs-edge", source, {**SETTINGS, **settings})
 
 
-def steps(efforts: tuple[float, ...] = (1,) * 6, **settings: Any) -> list[Step[Any]]:
+def steps(efforts: tuple[float, ...] = (1,) * 6, **settings: Any) -> list[EncodedFrame]:
     made = encoder(**settings)
     return [made.encode(replace(frame, epoch_scale=e)) for frame, e in zip(frames(), efforts, strict=True)]
 
 
 @cache
-def whole() -> tuple[Step[Any], ...]:
+def whole() -> tuple[EncodedFrame, ...]:
     return tuple(steps())
 
 
@@ -259,7 +259,7 @@ def test_the_key_packet_holds_the_refined_scene() -> None:
     found: list[Refinement] = []
     original = keyframes.refined_key_step
 
-    def watched(parts: Any, state: Any, *rest: Any) -> Step[Any]:
+    def watched(parts: Any, state: Any, *rest: Any) -> EncodedFrame:
         found.append(state.refinement)
         return original(parts, state, *rest)
 

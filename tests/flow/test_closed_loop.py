@@ -20,7 +20,7 @@ from gsstream.cli.main import run_command
 from gsstream.core.changes import Delta, Scene, apply_delta
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.rng import Rng
-from gsstream.engine.method.checked import difference_between
+from gsstream.engine.run.player_difference import difference_between
 from gsstream.engine.step import frame_step as step_module
 from gsstream.parts.motion.rigid import Rigid
 from gsstream.parts.render.reference import ReferenceRenderer

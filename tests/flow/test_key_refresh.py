@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from flow_runs import WORLD, Witness, encode, metrics
 
-from gsstream.engine.method import parts as method
+from gsstream.engine.run import parts_method as method
 from gsstream.packet import StreamReader, quantise_key
 from gsstream.player.manifest import manifest
 from gsstream.player.playback import Playback

@@ -82,7 +82,7 @@ class Stranger(StreamingMethod[Carried]):
         change = torch.zeros_like(work.gaussians.sh0)
         with tools.log.phase("optimise"):
             while iterations < views * tools.epochs(frame):
-                left = None if budget is None else budget.seconds_left()
+                left = budget.seconds_left()
                 if left is not None and left <= 0:
                     break
                 rows = replace(work.gaussians, sh0=work.gaussians.sh0 + change)
@@ -92,7 +92,7 @@ class Stranger(StreamingMethod[Carried]):
         return change
 
     def _fitting(self, player: PlayerState, change: torch.Tensor, tools: Tools) -> Sent:
-        step, most = self.config.step, None if tools.budget is None else tools.budget.max_bytes
+        step, most = self.config.step, tools.budget.max_bytes
         while True:
             symbols = torch.round(change[:, 0] / step).int().numpy()
             some = symbols.any(1)

@@ -16,9 +16,10 @@ from gsstream.core.errors import ComponentError, RecipeError
 from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.assembly.checks import Checks
-from gsstream.engine.method.checked import difference_between
-from gsstream.engine.method.wrapped import RepeatedFrameWarning, SkippedWorkWarning
+from gsstream.engine.budget.plan import unlimited
 from gsstream.engine.run.encoder import Callbacks, Encoder
+from gsstream.engine.run.player_difference import difference_between
+from gsstream.engine.run.run_frame import RepeatedFrameWarning, SkippedWorkWarning
 from gsstream.input.recordings.open import open_source
 from gsstream.method.base import StreamingMethod
 from gsstream.method.packets import send_delta
@@ -28,7 +29,7 @@ from gsstream.parts.render.exposure import Exposure
 from gsstream.parts.render.wrt import WrtRows
 from gsstream.player.playback import Playback
 from gsstream.recipe.load import resolve_recipe
-from gsstream.recipe.model import Recipe
+from gsstream.recipe.model import Stream
 from gsstream.testing.examples.streaming_method import ExampleMethod
 from gsstream.testing.method_driver import SOURCE, MethodUnderTest
 from gsstream.testing.streaming_method import check_method_closed_loop, check_method_resume
@@ -127,7 +128,6 @@ def fail(_step):
         (other_layout, "packet: layout: units"),
         (remember, "packet: scene: displacement"),
         (regroup, "packet: scene: groups"),
-        (lambda step: replace(step, metrics={"loss": 0.5}), "its step has metrics (loss): write numbers to tools.log"),
         (misname, "expected a packet of frame 1 of the kind it says, 'delta'; got 'empty' of frame 1"),
         (another_frame, "got 'empty' of frame 2"),
         (fail, "failed at frame 1: RuntimeError: out of ideas"),
@@ -249,10 +249,6 @@ def test_the_packet_is_out_before_the_work_that_follows_it() -> None:
         assert step.metrics["seconds"]["other"] > 0
 
 
-def number(_state, step, _frame):
-    return replace(step, metrics={"loss": 0.5})
-
-
 def swap_packet(_state, step, _frame):
     return replace(step, packet=replace(step.packet, data=step.packet.data[:-1]))
 
@@ -267,9 +263,8 @@ def swap_status(_state, step, _frame):
         (swap_packet, "packet or status"),
         (swap_status, "packet or status"),
         (lambda _state, step, _frame: drift(step), "means is off by up to 0.25"),
-        (number, "metrics"),
     ],
-    ids=["packet", "status", "player", "metrics"],
+    ids=["packet", "status", "player"],
 )
 def test_what_has_been_handed_out_is_not_changed_afterwards(wrong, message: str) -> None:
     with pytest.raises(ComponentError, match="its follow_up changed what has been handed out: ") as caught:
@@ -444,7 +439,7 @@ class TestTools:
 
     def test_a_frame_that_is_worth_less_has_fewer_epochs(self, begun) -> None:
         subject, _, _, now = begun
-        tools = replace(subject.encoder()._tools(), assembly=replace(subject.assembly, recipe=Recipe()))
+        tools = subject.encoder()._tools(unlimited(Stream()))
         assert [tools.epochs(replace(now, epoch_scale=e)) for e in (1.0, 0.5, 0.01)] == [20, 10, 1]
 
 

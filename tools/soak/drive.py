@@ -18,10 +18,10 @@ import numpy as np
 from gsstream.core.errors import ComponentError, InputError, PluginUnavailable, ShapeError
 from gsstream.discovery.catalog import Catalog
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.method.wrapped import RepeatedFrameWarning, SkippedWorkWarning
+from gsstream.engine.run.encoder import EncodedFrame
 from gsstream.engine.run.recording import open_recording
+from gsstream.engine.run.run_frame import RepeatedFrameWarning, SkippedWorkWarning
 from gsstream.engine.run.session import METRICS, STREAM, RunListener, run
-from gsstream.method.base import Step
 from gsstream.packet import PlayerState
 from gsstream.player.playback import Playback
 from gsstream.player.render import find_renderer, render
@@ -76,7 +76,7 @@ def _encode_and_check(case: Case, parts: Assembly, catalog: Catalog, out: Path, 
     kinds: dict[str, int] = {}
 
     class Witness(RunListener):
-        def after(self, step: Step[Any]) -> Mapping[str, Any]:
+        def after(self, step: EncodedFrame) -> Mapping[str, Any]:
             digests.append(digest(step.state.player))
             kinds[step.status] = kinds.get(step.status, 0) + 1
             return {}

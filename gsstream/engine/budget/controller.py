@@ -6,18 +6,15 @@ Its memory is the run's ``metrics.jsonl`` alone, so a resumed run plans as the f
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
 from gsstream.core.log import FrameLog
-from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.budget.epoch_scheduler import Allowance, EpochScheduler
-from gsstream.engine.budget.plan import WINDOW, Past, plan, read_past_frame
-from gsstream.engine.budget.schedule import Schedule
-from gsstream.engine.budget.trim import TrimmedDelta
+from gsstream.engine.budget.plan import WINDOW, Past, plan, read_past_frame, unlimited
 from gsstream.method.base import Step
-from gsstream.method.tools import FrameBudget
+from gsstream.method.budget import FrameBudget
 from gsstream.metrics import peak_memory_mb
 from gsstream.recipe.budget import Budget
 from gsstream.recipe.model import Stream
@@ -36,61 +33,50 @@ class Controller:
         for line in lines if self.budget.limits_anything else ():
             self._note(line)
 
-    def allow(self, log: FrameLog) -> Allowance | None:
-        """Return what the frame of this log may spend; None without a limit on frames."""
-        if not self.budget.limits_frames:
-            return None
-        return Allowance.start(plan(self.budget, self._stream, self._history), log.elapsed())
+    def allow(self, log: FrameLog, first: bool = False) -> FrameBudget:
+        """Return what the frame of this log may spend; a stream's first, from which all starts, has no limit."""
+        if first or not self.budget.limits_frames:
+            return unlimited(self._stream)
+        clock = time.perf_counter
+        return replace(plan(self.budget, self._stream, self._history), started=clock() - log.elapsed(), clock=clock)
 
-    def describe(self, budget: Allowance, step: Step[Any], views: int, log: FrameLog) -> None:
-        """Log what a frame spent of its budget, where its method made iterations or logged its own use (``budget``).
-
-        Without it, a method is described by its phases and the size of its packet.
-        """
-        numbers = log.numbers
-        if not numbers.get("iterations") and "budget" not in numbers:
-            return
-        used = numbers.get("budget") or {
-            "rd_lambda": budget.plan.rd_lambda,
-            "estimate": 0.0,
-            "stopped_by_clock": False,
-            "untrimmed": len(step.packet.data),
-            "dropped": {},
-            "before": log.seconds("change", "motion", "confidence"),
-            "optimise": log.seconds("optimise"),
-        }
-        used = {**used, "parts": log.seconds("motion", "growth")}
-        log.set(budget=spent(budget, used, self._stream, numbers.get("iterations", 0) / views))
-
-    def key_refusal(self, num_gaussians: int, allowance: Allowance | None) -> str | None:
+    def key_refusal(self, allowed: FrameBudget, num_gaussians: int) -> str | None:
         """Say why a key packet that is due must wait, by what the last one cost; None: it may be tried."""
-        if allowance is None or self._key is None:
+        if self._key is None or not allowed.is_limited:
             return None
         size, seconds = (value * num_gaussians for value in self._key)
         if self.budget.size is not None and 0.9 * size > self.budget.size:
             return f"about {size:.0f} bytes where {self.budget.size} are allowed"
-        if self.budget.time is not None and allowance.clock() - allowance.started + seconds > self.budget.time:
+        if self.budget.time is not None and allowed.clock() - allowed.started + seconds > self.budget.time:
             return f"about {seconds:.2f} s where {self.budget.time:g} s are allowed for the frame"
         return None
 
-    def settle(self, frame: int, status: str, log: FrameLog) -> None:
-        """Complete the entry ``budget`` of a finished frame, and remember what the frame cost."""
-        numbers = log.numbers
-        entry, seconds = dict(numbers.get("budget", {})), log.elapsed()
-        size, first = sum(numbers["bytes"].values()), frame == 0
-        actual = {"time": seconds, "size": size, "memory": 1e6 * peak_memory_mb()}
-        limits = {name: getattr(self.budget, name) for name in actual if getattr(self.budget, name) is not None}
-        if first:  # what everything starts from is no frame of a budget (docs/howto/budget.md)
-            limits = {name: limit for name, limit in limits.items() if name == "memory"}
+    def settle(self, step: Step[Any], allowed: FrameBudget, views: int, log: FrameLog) -> None:
+        """Log what a finished frame cost, what bound it and what it gave up, and plan with that from then on.
+
+        Arguments:
+            step: of the frame.
+            allowed: what :meth:`allow` returned for it.
+            views: training cameras, an iteration for each of which is an epoch.
+            log: its log. A method that has made iterations, or has logged its own use as ``budget``, is described by
+                that, or else by its phases and the size of its packet.
+        """
+        if not self.budget.limits_anything:
+            return
+        numbers, seconds, entry = log.numbers, log.elapsed(), dict[str, Any]()
+        actual = {"time": seconds, "size": len(step.packet.data), "memory": 1e6 * peak_memory_mb()}
+        known = actual if allowed.is_limited else ("memory",)
+        limits = {name: limit for name in known if (limit := getattr(self.budget, name)) is not None}
+        if allowed.is_limited and (numbers.get("iterations") or "budget" in numbers):
+            used = {**(numbers.get("budget") or _phases(step, allowed, log)), "parts": log.seconds("motion", "growth")}
+            entry = spent(allowed, used, self._stream, numbers.get("iterations", 0) / views)
+            entry["usage"]["seconds"] = seconds
         entry["limits"] = limits
         entry["actual"] = {name: actual[name] for name in limits}
         entry["violated"] = [name for name, limit in limits.items() if actual[name] > limit]
-        if "usage" in entry:
-            entry["usage"] = {**entry["usage"], "seconds": seconds}
-            entry["binding"] = [name for name in entry.get("binding", []) if name in limits]
         log.set(budget=entry)
         # As it will be read back: a resumed run must plan with the same numbers.
-        self._note(json.loads(json.dumps({"frame": frame, "status": status, **log.entry()})))
+        self._note(json.loads(json.dumps({"frame": step.packet.frame, "status": step.status, **log.entry()})))
 
     def _note(self, metrics: Mapping[str, Any]) -> None:
         if metrics["status"] == "key" and metrics["num_gaussians"]:
@@ -102,39 +88,25 @@ class Controller:
             self._history = (*self._history, past)[-WINDOW:]
 
 
-def apply_plan(assembly: Assembly, budget: FrameBudget) -> Assembly:
-    """Return the parts with the recipe of one frame: the plan's epochs, threshold and weight."""
-    assert isinstance(budget, Allowance)
-    frame_plan = budget.plan
-    changes = {
-        "epochs": frame_plan.epochs,
-        "change_threshold": frame_plan.change_threshold,
-        "rd_lambda": frame_plan.rd_lambda,
-    }
-    recipe = assembly.recipe
-    return replace(assembly, recipe=recipe.model_copy(update={"stream": recipe.stream.model_copy(update=changes)}))
-
-
-def usage(pace: Schedule, fitted: TrimmedDelta) -> dict[str, Any]:
-    """Return what the optimisation of a frame used, and what fitting its packet gave up: raw numbers for the log."""
-    assert isinstance(pace, EpochScheduler)
+def _phases(step: Step[Any], allowed: FrameBudget, log: FrameLog) -> dict[str, Any]:
+    """What a frame used, by its phases and its packet."""
     return {
-        "rd_lambda": pace.mean_rate_weight,
-        "estimate": pace.estimate,
-        "stopped_by_clock": pace.stopped_by_clock,
-        "untrimmed": fitted.untrimmed,
-        "before": pace.before,
-        "optimise": pace.optimise,
-        "dropped": {"symbols": fitted.symbols, "gates": fitted.gates, "added": fitted.added},
+        "rd_lambda": allowed.rd_lambda,
+        "estimate": 0.0,
+        "stopped_by_clock": False,
+        "untrimmed": len(step.packet.data),
+        "dropped": {},
+        "before": log.seconds("change", "motion", "confidence"),
+        "optimise": log.seconds("optimise"),
     }
 
 
-def spent(budget: Allowance, used: Mapping[str, Any], stream: Stream, epochs: float) -> dict[str, Any]:
+def spent(plan: FrameBudget, used: Mapping[str, Any], stream: Stream, epochs: float) -> dict[str, Any]:
     """Return the entry ``budget`` of a frame, before its limits and the cost of the whole frame are added.
 
-    ``used`` is that of :func:`usage`; ``stream`` holds the recipe's own settings, from which the plan departed.
+    ``used`` is that of :meth:`EpochScheduler.usage`, with the seconds of motion and growth as ``parts``; ``stream``
+    holds the recipe's own settings, from which the plan departed.
     """
-    plan = budget.plan
     reduced: dict[str, Any] = {}
     if plan.max_bytes is not None:
         if used["rd_lambda"] > 1.05 * stream.rd_lambda:

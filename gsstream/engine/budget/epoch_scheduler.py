@@ -1,122 +1,98 @@
-"""How the optimiser keeps to a plan: how many passes the clock still allows, and how strongly bits are weighed."""
+"""How the optimiser keeps to a budget: how many passes the clock still allows, and how strongly bits are weighed."""
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from statistics import mean
+from typing import Any
 
 import torch
 
-from gsstream.core.frame import Frame
 from gsstream.engine.budget.plan import (
     MAX_TRIMMED,
     MAX_WEIGHT,
     MIN_WEIGHT,
     SIZE_TARGET,
     UNKNOWN_RESERVE,
-    FramePlan,
     epochs_in,
     scale_epoch_seconds,
 )
-from gsstream.engine.budget.schedule import Schedule
-from gsstream.method.tools import FrameBudget
-from gsstream.recipe.model import Stream
+from gsstream.engine.budget.trim import TrimmedDelta
+from gsstream.method.budget import FrameBudget
 
 #: Share of the passes after which the size is first estimated: before that, residuals are still growing.
 SIZE_ESTIMATE_START = 0.25
 
 
-@dataclass(frozen=True)
-class Allowance:
-    """A plan and the clock it runs against; ``started`` is the start of the frame by that clock."""
+class EpochScheduler:
+    """Passes and rate weight of one frame, corrected by what its own passes take where the budget limits them.
 
-    plan: FramePlan
-    started: float
-    clock: Callable[[], float]
+    ``epochs`` (passes that are planned), ``done`` (passes that are made) and ``rd_lambda`` (loss per bit) are read in
+    every pass. It measures by itself: a piece of a pass lasts until the next piece is asked for.
 
-    @staticmethod
-    def start(plan: FramePlan, elapsed: float = 0.0) -> Allowance:
-        """Return an allowance of a frame that began ``elapsed`` seconds ago."""
-        return Allowance(plan, time.perf_counter() - elapsed, time.perf_counter)
-
-    @property
-    def max_bytes(self) -> int | None:
-        return self.plan.max_bytes
-
-    @property
-    def epochs(self) -> int:
-        return self.plan.epochs
-
-    @property
-    def step_scale(self) -> float:
-        return self.plan.step_scale
-
-    @property
-    def part_scale(self) -> float:
-        return self.plan.part_scale
-
-    def seconds_left(self) -> float | None:
-        return None if self.plan.seconds is None else self.started + self.plan.seconds - self.clock()
-
-
-class EpochScheduler(Schedule):
-    """Passes and weight of one frame under a budget, corrected by what its own passes take.
-
-    ``epoch_scale``: share of the passes that the frame is worth, and of the time that they have.
+    Arguments:
+        budget: of the frame.
+        views: training cameras.
+        candidates: how many Gaussians take part.
+        epoch_scale: share of the passes that the frame is worth, and of the time that they have.
     """
 
-    def __init__(
-        self, allowance: Allowance, epochs: int, rd_lambda: float, views: int, epoch_scale: float = 1.0
-    ) -> None:
-        super().__init__(epochs, rd_lambda)
-        plan = allowance.plan
-        self._timed = allowance if plan.seconds is not None else None
-        self.chunk = 1 if self._timed else None
-        # With a time budget the number of passes in the plan is a prediction, and the clock may allow more.
-        self._most = max(epochs, round(epoch_scale * plan.max_epochs)) if self._timed else epochs
-        self._epoch_scale = epoch_scale
-        self.estimate = 0.0
-        self._weights: list[float] = []
-        self.stopped_by_clock = False
-        self._allowance, self._views = allowance, views
+    def __init__(self, budget: FrameBudget, views: int, candidates: int, epoch_scale: float = 1.0) -> None:
+        self.budget, self._views, self._epoch_scale = budget, views, epoch_scale
+        self.epochs, self.done = max(1, round(budget.epochs * epoch_scale)), 0
+        self.rd_lambda, self.estimate, self._weights = budget.rd_lambda, 0.0, list[float]()
+        #: Whether the clock allows fewer passes than there could be; whether it has ended one in the middle.
+        self.stopped_by_clock = self.is_cut = False
+        self._piece_began, self._pieces = budget.clock(), list[float]()
         #: Seconds until the optimisation began, and of it, by the budget's clock.
-        self.before, self.optimise = allowance.clock() - allowance.started, 0.0
-        #: Seconds a pass is expected to take.
-        self._each = 0.0
-        self._iteration_began = 0.0
-        self._iterations: list[float] = []
-
-    def start(self, candidates: int) -> None:
-        """Note that the first pass begins, with so many Gaussians."""
-        if self._timed is None:
+        self.before, self.optimise = self._piece_began - budget.started, 0.0
+        if budget.seconds is None:
             return
-        now, plan = self._timed.clock(), self._timed.plan
-        self._iteration_began = now
+        self._seconds = budget.seconds
+        # With a limit on time the number of passes is a prediction, and the clock may allow more.
+        self._most = max(self.epochs, round(epoch_scale * budget.max_epochs))
         # The phases before the passes render every view once, forwards and backwards. Without earlier frames to go by,
         # their time is the estimate of a pass.
-        before = now - self._timed.started
-        self._each = before if plan.each is None else scale_epoch_seconds(plan.each, plan.candidates, candidates)
-        self.epochs = epochs_in(self._left(now), self._each, self._most)
+        each = budget.each
+        self._each = self.before if each is None else scale_epoch_seconds(each, budget.candidates, candidates)
+        self.epochs = epochs_in(self._left(), self._each, self._most)
 
-    def _left(self, now: float) -> float:
-        """Seconds for passes from now on.
+    @property
+    def goes_on(self) -> bool:
+        """Whether another pass is to be made."""
+        return self.done < self.epochs and not self.is_cut
 
-        What follows them is not known before a frame has shown it: until then it is taken for one more pass.
+    def next_pass(self, order: Sequence[int]) -> Iterator[Sequence[int]]:
+        """Yield the views of a pass in this order: one by one, until the clock ends it, under a limit on time."""
+        timed = self.budget.seconds is not None
+        some = 1 if timed else len(order)
+        for begin in range(0, len(order), some):
+            yield order[begin : begin + some]
+            self._measure()
+            if timed and self._is_late():
+                self.is_cut = self.stopped_by_clock = True
+                return
+        self.done += 1
+        if timed:
+            self._plan_rest()
+
+    def weigh_bytes(self, estimate: Callable[[], float]) -> None:
+        """Move the weight of the rate by what a pass would have sent, where a size is to be met.
+
+        ``estimate``: bytes, before the correction; it is called only where a size is to be met.
         """
-        assert self._timed is not None
-        assert self._timed.plan.seconds is not None
-        seconds, after = self._timed.plan.seconds, self._timed.plan.after
-        kept = min(self._each, UNKNOWN_RESERVE * seconds) if after is None else after
-        # A run that is behind hurries to catch up: what the passes of a hurried frame leave of its time is not theirs.
-        given_up = (1 - self._epoch_scale) * (seconds - kept - self.before)
-        return self._timed.started + seconds - kept - now - max(0.0, given_up)
-
-    def finish(self) -> None:
-        """Note that the optimisation has ended."""
-        self.optimise = self._allowance.clock() - self._allowance.started - self.before
+        limit = self.budget.max_bytes
+        if limit is None:
+            return
+        self.estimate = estimate()
+        self._weights.append(self.rd_lambda)
+        if self.done < SIZE_ESTIMATE_START * self.epochs:
+            return
+        expected = self.estimate * self.budget.correction
+        # Between the two bounds the weight stays, and trimming makes the packet fit.
+        wanted = min(max(expected, SIZE_TARGET * limit), MAX_TRIMMED * limit)
+        self.rd_lambda = next_rate_weight(self.rd_lambda, expected, wanted)
 
     @property
     def mean_rate_weight(self) -> float:
@@ -124,67 +100,55 @@ class EpochScheduler(Schedule):
         last = self._weights[len(self._weights) // 2 :] or [self.rd_lambda]
         return math.exp(sum(map(math.log, last)) / len(last)) if min(last) > 0 else self.rd_lambda
 
-    def is_over(self) -> bool:
-        """Say, after every iteration, whether the time for another one is gone."""
-        if self._timed is None:
-            return False
-        now = self._timed.clock()
-        self._iterations.append(now - self._iteration_began)
-        self._iteration_began = now
-        usual = self._last_epoch_seconds()
-        if usual and self._timed.plan.each is None and len(self._iterations) < self._views:
-            self._each = self._views * mean(usual)
-            made = len(self._iterations) / self._views
-            self.epochs = epochs_in(self._left(now) + made * self._each, self._each, self._most)
-        self.stopped_by_clock = max(usual[-3:], default=0.0) > self._left(now)
-        return self.stopped_by_clock
+    def usage(self, fitted: TrimmedDelta) -> dict[str, Any]:
+        """Return what the optimisation used, and what fitting its packet gave up: raw numbers for the log."""
+        return {
+            "rd_lambda": self.mean_rate_weight,
+            "estimate": self.estimate,
+            "stopped_by_clock": self.stopped_by_clock,
+            "untrimmed": fitted.untrimmed,
+            "before": self.before,
+            "optimise": self.optimise,
+            "dropped": {"symbols": fitted.symbols, "gates": fitted.gates, "added": fitted.added},
+        }
 
-    def end_epoch(self, done: int) -> None:
-        """Plan the passes that are left by what the last one took. ``done``: passes made."""
-        if self._timed is None:
-            return
-        now = self._timed.clock()
-        self._each = self._views * mean(self._last_epoch_seconds() or self._iterations)
-        left = self._left(now)
-        more = 0 if left < 0.25 * self._each else epochs_in(left, self._each, max(1, self._most - done))
-        self.epochs = min(done + more, self._most)
-        self.stopped_by_clock = self.epochs == done < self._most
+    def _measure(self) -> None:
+        """Note what the last piece took."""
+        now = self.budget.clock()
+        self._pieces.append(now - self._piece_began)
+        self._piece_began, self.optimise = now, now - self.budget.started - self.before
 
-    def _last_epoch_seconds(self) -> list[float]:
-        """Seconds of the iterations of the last pass, without the frame's first, which pays for what is made once."""
-        return self._iterations[1:][-self._views :]
+    def _left(self) -> float:
+        """Seconds for passes since the clock was read last.
 
-    def weigh_bytes(self, done: int, estimate: Callable[[], float]) -> None:
-        """Move the weight of the rate by what a pass would have sent, where a size is to be met.
-
-        ``estimate``: bytes, before the correction.
+        What follows them is not known before a frame has shown it: until then it is taken for one more pass.
         """
-        plan = self._allowance.plan
-        if plan.max_bytes is None:
-            return
-        self.estimate = estimate()
-        self._weights.append(self.rd_lambda)
-        if done < SIZE_ESTIMATE_START * self.epochs:
-            return
-        expected = self.estimate * plan.correction
-        # Between the two bounds the weight stays, and trimming makes the packet fit.
-        wanted = min(max(expected, SIZE_TARGET * plan.max_bytes), MAX_TRIMMED * plan.max_bytes)
-        self.rd_lambda = next_rate_weight(self.rd_lambda, expected, wanted)
+        seconds, after = self._seconds, self.budget.after
+        kept = min(self._each, UNKNOWN_RESERVE * seconds) if after is None else after
+        # A run that is behind hurries to catch up: what the passes of a hurried frame leave of its time is not theirs.
+        given_up = (1 - self._epoch_scale) * (seconds - kept - self.before)
+        return self.budget.started + seconds - kept - self._piece_began - max(0.0, given_up)
 
+    def _is_late(self) -> bool:
+        """Say, after a view, whether the time for another one is gone."""
+        usual = self._last_pass()
+        if usual and self.budget.each is None and len(self._pieces) < self._views:
+            self._each = self._views * mean(usual)
+            made = len(self._pieces) / self._views
+            self.epochs = epochs_in(self._left() + made * self._each, self._each, self._most)
+        return max(usual[-3:], default=0.0) > self._left()
 
-def scheduled(stream: Stream, frame: Frame, budget: FrameBudget | None) -> Schedule:
-    """Return the schedule of a frame: as the recipe, or the plan of its budget, says."""
-    epochs = max(1, round(stream.epochs * frame.epoch_scale))
-    if budget is None:
-        return Schedule(epochs, stream.rd_lambda)
-    assert isinstance(budget, Allowance)
-    return EpochScheduler(
-        allowance=budget,
-        epochs=epochs,
-        rd_lambda=stream.rd_lambda,
-        views=len(frame.cameras),
-        epoch_scale=frame.epoch_scale,
-    )
+    def _plan_rest(self) -> None:
+        """Plan the passes that are left by what the last one took."""
+        self._each = self._views * mean(self._last_pass() or self._pieces)
+        left = self._left()
+        more = 0 if left < 0.25 * self._each else epochs_in(left, self._each, max(1, self._most - self.done))
+        self.epochs = min(self.done + more, self._most)
+        self.stopped_by_clock = self.epochs == self.done < self._most
+
+    def _last_pass(self) -> list[float]:
+        """Seconds of the views of the last pass, without the frame's first, which pays for what is made once."""
+        return self._pieces[1:][-self._views :]
 
 
 def next_rate_weight(weight: float, expected: float, wanted: float) -> float:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
+from gsstream.method.budget import FrameBudget
 from gsstream.recipe.budget import Budget
 from gsstream.recipe.model import Stream
 
@@ -86,31 +87,13 @@ def read_past_frame(metrics: Mapping[str, Any]) -> Past | None:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class FramePlan:
-    """The settings with which the next frame is made, and what it is expected to cost."""
-
-    epochs: int  # passes over the cameras; with a time budget a prediction, corrected after every pass
-    change_threshold: float
-    rd_lambda: float  # at the start; moved after every pass where a size is to be met
-    max_epochs: int = 0  # passes that are not exceeded however much time is left
-    step_scale: float = 1.0  # factor on all quantisation steps, >= 1
-    part_scale: float = 1.0  # share of their usual passes that motion and growth make, in a frame without a residual
-    max_bytes: int | None = None  # the size that must not be exceeded, or None
-    correction: float = 1.0  # real bytes per estimated byte
-    seconds: float | None = None  # what may be planned with from the start of the frame, or None
-    #: Seconds of it to keep for what follows the passes; None: unknown, the frame's own passes will tell.
-    after: float | None = None
-    #: each, candidates: seconds that a pass has taken, with so many Gaussians; None while nothing is known.
-    each: float | None = None
-    candidates: int = 0
-    #: predicted_seconds, predicted_bytes: what the frame is expected to cost; None while nothing is known.
-    predicted_seconds: float | None = None
-    predicted_bytes: float | None = None
+def unlimited(stream: Stream) -> FrameBudget:
+    """Return the budget of a frame without limits: the numbers of the recipe."""
+    return FrameBudget(stream.epochs, stream.change_threshold, stream.rd_lambda)
 
 
-def plan(budget: Budget, stream: Stream, history: Sequence[Past]) -> FramePlan:
-    """Return what the next frame is to spend."""
+def plan(budget: Budget, stream: Stream, history: Sequence[Past]) -> FrameBudget:
+    """Return what the next frame is to spend; when it starts is not known here."""
     recent = history[-WINDOW:]
     each, (before, after) = seconds_per_epoch(recent), _other_seconds(recent)
     epochs = _epochs(budget, stream, each, before + after)
@@ -119,7 +102,7 @@ def plan(budget: Budget, stream: Stream, history: Sequence[Past]) -> FramePlan:
     seconds = None if budget.time is None else TIME_MARGIN * budget.time
     known = [p.untrimmed for p in recent[-3:]]
     expected = min(median(known), size or math.inf) if known else None
-    return FramePlan(
+    return FrameBudget(
         epochs=epochs,
         change_threshold=_threshold(budget, stream, recent),
         rd_lambda=_weight(budget, stream, recent) if held else stream.rd_lambda,

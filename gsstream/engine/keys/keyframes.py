@@ -19,6 +19,7 @@ from gsstream.engine.frame0.first_layer import first_layer_mask
 from gsstream.engine.frame0.rd_quantise import rd_quantise
 from gsstream.engine.frame0.refine import SHOWN, is_refined
 from gsstream.engine.state.stream_state import Step, StreamState
+from gsstream.engine.step.metrics import log_packet
 from gsstream.method.tools import Tools
 from gsstream.packet import StreamMeta, quantise_key
 
@@ -42,9 +43,10 @@ def key_packet_if_due(assembly: Assembly, step: Step, frame: Frame, tools: Tools
     made, shown = (refined_key_step, frame) if reason == REFINED else (reencode_as_key, state.previous)
     with tools.log.phase("key"):
         after = made(assembly, state, frame, tools.meta(frame), tools.rng)
-    max_bytes = None if tools.budget is None else tools.budget.max_bytes
+    max_bytes = tools.budget.max_bytes
     if max_bytes is not None and len(after.packet.data) > max_bytes:
         return _postponed(step, reason, f"{len(after.packet.data)} bytes where {max_bytes} are allowed", tools)
+    log_packet(tools.log, state.player, step.packet)  # what changed in the frame: the key packet does not say it
     tools.log.set(key_reason=reason)
     return Step(replace(after.state, previous=shown), after.packet, "key")
 
@@ -52,7 +54,7 @@ def key_packet_if_due(assembly: Assembly, step: Step, frame: Frame, tools: Tools
 def _due(assembly: Assembly, step: Step) -> str | None:
     """Why the frame is to become a key packet; None: it is not.
 
-    It is not asked of frames whose iterations of a refinement follow their packets (``engine.method.parts``).
+    It is not asked of frames whose iterations of a refinement follow their packets (``engine.run.parts_method``).
     """
     every, state = assembly.recipe.codec.key_interval, step.state
     if step.status == "key":

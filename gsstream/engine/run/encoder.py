@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import torch
 
@@ -20,17 +21,18 @@ from gsstream.core.storage import packed
 from gsstream.core.world import snap_cameras
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.controller import Controller
+from gsstream.engine.budget.plan import unlimited
 from gsstream.engine.frame0.begin import CARRIED
 from gsstream.engine.frame0.optimise import Progress
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.frame0.reproject import to_stream_coordinates
 from gsstream.engine.frame0.reuse import point_cloud_of
 from gsstream.engine.keys.resume import check_stream, read_end, states_since_key
-from gsstream.engine.method.wrapped import wrapped
+from gsstream.engine.run.run_frame import live_method, run_follow_up, run_frame, run_resume
 from gsstream.engine.step.tools import RunTools
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.input.seeds.shell import mean_color
-from gsstream.method.base import Step
+from gsstream.method.budget import FrameBudget
 from gsstream.metrics import peak_memory_mb
 from gsstream.packet import EncodedPacket, PlayerState, StreamMeta
 from gsstream.recipe.budget import sized
@@ -53,12 +55,29 @@ class Callbacks:
     progress: Progress = lambda *_: None
 
 
+@dataclass(frozen=True)
+class EncodedFrame:
+    """A frame that is encoded.
+
+    Arguments:
+        state: of the method after the frame; ``state.player`` is what every player has.
+        packet: what a player reads.
+        status: kind of the packet.
+        metrics: what the frame cost: its line of ``metrics.jsonl``.
+    """
+
+    state: Any
+    packet: EncodedPacket
+    status: Literal["key", "delta", "empty"]
+    metrics: Mapping[str, Any]
+
+
 class Encoder:
     """Encodes the frames of one recording with one method, in memory.
 
-    :meth:`encode` takes the frames in order and returns a :class:`gsstream.method.base.Step` for each: its ``packet``
-    is what a player reads, its ``metrics`` say what the frame cost. A frame that fails leaves the encoder as it was.
-    ``callbacks.packet`` gets a packet as soon as it is made; some methods work on after it in the same call.
+    :meth:`encode` takes the frames in order and returns an :class:`EncodedFrame` for each. A frame that fails leaves
+    the encoder as it was. ``callbacks.packet`` gets a packet as soon as it is made; some methods work on after it in
+    the same call.
 
     Arguments:
         assembly: the live parts of a recipe (``engine.assembly.assemble``).
@@ -98,9 +117,9 @@ class Encoder:
     @assembly.setter
     def assembly(self, assembly: Assembly) -> None:
         self._assembly = assembly
-        self.method = wrapped(assembly, self.controller)
+        self.method = live_method(assembly)
 
-    def encode(self, frame: Frame) -> Step[Any]:
+    def encode(self, frame: Frame) -> EncodedFrame:
         """Encode the next frame: the first as a key packet, later ones as the method decides.
 
         Arguments:
@@ -119,20 +138,21 @@ class Encoder:
             raise InputError(f"frame {frame.index}: expected frame {expected}, frames are encoded in order")
         if self.assembly.background != (background := self._background(frame)):
             self.assembly = replace(self.assembly, background=background)
-        frame, method = self.with_near_plane(frame), self.method
-        log, worked = FrameLog(), time.process_time()
-        tools = self._tools(log=log)
+        frame, log, worked = self.with_near_plane(frame), FrameLog(), time.process_time()
+        budget = self.controller.allow(log, first=self.state is None)
+        tools = self._tools(budget, log=log, key_refusal=partial(self.controller.key_refusal, budget))
         with one_torch_thread():
-            step = method.begin(frame, tools) if self.state is None else method.step(self.state, frame, tools)
+            step = run_frame(self.method, self.state, frame, tools)
         step = replace(step, packet=replace(step.packet, decoded=None))  # a queue of packets must not hold scenes
         self._listeners.packet(step.packet)
         if self.state is not None:  # only now, so that the packet is not delayed by it
             with one_torch_thread():
-                step = method.follow_up(self.state, step, frame, tools)
+                step = run_follow_up(self.method, self.state, step, frame=frame, tools=tools)
+        self.controller.settle(step, budget, len(frame.cameras), log)
         log.set(cpu_seconds=time.process_time() - worked, peak_memory_mb=peak_memory_mb())
-        step = replace(step, metrics={"frame": frame.index, "status": step.status, **log.entry()})
         self.state = step.state
-        return step
+        metrics = {"frame": frame.index, "status": step.status, **log.entry()}
+        return EncodedFrame(step.state, step.packet, step.status, metrics)
 
     def resume(self, stream: Path, image: Callable[[int], Frame], last: int | None = None) -> int | None:
         """Go on after the last sound packet of a stream that this method wrote; return that frame's index.
@@ -157,11 +177,10 @@ class Encoder:
         tools = self._tools(
             replay=lambda: states_since_key(stream, end), recorded=lambda index: self.with_near_plane(image(index))
         )
-        self.assembly.where.enter(end.player.frame)
         with one_torch_thread():
             shown = self.with_near_plane(image(end.shown))
             shown = replace(shown, images=packed(shown.images))
-            self.state = self.method.resume(end.player, shown, tools)
+            self.state = run_resume(self.method, end.player, shown, tools)
         return end.player.frame
 
     def with_near_plane(self, frame: Frame) -> Frame:
@@ -171,12 +190,13 @@ class Encoder:
             cameras = snap_cameras(self.info.world.inverse_cameras(cameras))
         return replace(frame, cameras=replace(cameras, near_plane=self.near_plane))
 
-    def _tools(self, **changes: Any) -> RunTools:
+    def _tools(self, budget: FrameBudget | None = None, **changes: Any) -> RunTools:
         return RunTools(
             self.assembly,
             self.rng,
             self._meta,
             self._points,
+            budget=budget or unlimited(self.assembly.recipe.stream),
             first=self._first,
             progress=self._listeners.progress,
             **changes,

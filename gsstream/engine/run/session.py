@@ -18,7 +18,7 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.memory import limit_memory
 from gsstream.engine.frame0.points import gather_points, with_test_views
 from gsstream.engine.run.displacement import displacement_pixels
-from gsstream.engine.run.encoder import Callbacks, Encoder
+from gsstream.engine.run.encoder import Callbacks, EncodedFrame, Encoder
 from gsstream.engine.run.few_cameras import expectation, first_frame_summary
 from gsstream.engine.run.live import live_metrics
 from gsstream.engine.run.measure import HeldOut
@@ -27,7 +27,6 @@ from gsstream.engine.run.metrics_log import add_metrics, append_metrics, last_wr
 from gsstream.engine.run.progress import RunProgress
 from gsstream.input.recordings.base import AdaptiveSource, FrameSource, LiveSource, SourceInfo
 from gsstream.input.recordings.prefetch import Prefetcher
-from gsstream.method.base import Step
 from gsstream.packet import EncodedPacket, PlayerState, StreamReader, StreamWriter
 from gsstream.packet.base import FILE_HEADER
 from gsstream.recipe.save import save_resolved
@@ -41,7 +40,7 @@ class RunListener:
     def before(self) -> None:
         """Start what is measured: a frame's images are in memory, and it is encoded next."""
 
-    def after(self, step: Step[Any]) -> Mapping[str, Any]:
+    def after(self, step: EncodedFrame) -> Mapping[str, Any]:
         """Return what is to stand in the frame's line of metrics, too; its packet is written already."""
         return {}
 
@@ -142,7 +141,7 @@ class _Run:
         self._restore_metrics(last + 1)
         return last + 1
 
-    def record(self, step: Step[Any], train: Frame, test: Frame, numbers: Mapping[str, Any]) -> None:
+    def record(self, step: EncodedFrame, train: Frame, test: Frame, numbers: Mapping[str, Any]) -> None:
         """Write down what a frame cost and how good it is."""
         metrics = {**step.metrics, **numbers, "live": live_metrics(train, self.written)}
         metrics["displacement_pixels"] = displacement_pixels(step.state.player, train.cameras)

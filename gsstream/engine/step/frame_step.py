@@ -21,14 +21,13 @@ from gsstream.core.storage import packed
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.assembly.guard import error_context
-from gsstream.engine.budget.controller import usage
-from gsstream.engine.budget.epoch_scheduler import scheduled
+from gsstream.engine.budget.epoch_scheduler import EpochScheduler
 from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.engine.state.stream_state import Resident, Step, StreamState, next_state, updated
 from gsstream.engine.step.active.candidates import CHANGE_VOTES, candidates
 from gsstream.engine.step.active.change_on_device import find_change
 from gsstream.engine.step.context import EngineContext
-from gsstream.engine.step.metrics import log_packet, step_numbers
+from gsstream.engine.step.metrics import step_numbers
 from gsstream.engine.step.motion import propose_motion
 from gsstream.engine.step.optimise import optimise
 from gsstream.engine.step.problem import Problem
@@ -45,13 +44,12 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
 
     Raises ComponentError when a part fails.
     """
-    log, rng, stream, scope = tools.log, tools.rng, assembly.recipe.stream, assembly.update.scope(frame.index)
-    assembly.where.enter(frame.index)
+    log, budget, rng, scope = tools.log, tools.budget, tools.rng, assembly.update.scope(frame.index)
     if frame.epoch_scale == 0:  # a skipped frame: a source that is behind does not read its images
         return empty_step(state, frame, log)
     with log.phase("change"):
         images = FrameImages(frame.images, assembly.renderer.device)
-        change = find_change(state, frame, images, stream.change_threshold)
+        change = find_change(state, frame, images, budget.change_threshold)
     if change is not None and change.share == 0 and scope is not Scope.ALL:
         return empty_step(state, frame, log)
     late = assembly.checks is not Checks.STEP
@@ -60,8 +58,7 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
     with log.phase("confidence"), deferred_checks(late):
         rows, logits = select(assembly, work, work.hierarchy, scope)
     with log.phase("optimise"):
-        generator, views = rng.stream("frame", frame.index), len(frame.cameras)
-        target = (work.everywhere() if scope is Scope.ALL else work).residual_target
+        schedule = EpochScheduler(budget, len(frame.cameras), len(rows), frame.epoch_scale)
         problem = Problem(
             layout=scene.layout,
             hierarchy=work.hierarchy,
@@ -70,22 +67,18 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
             logits=logits,
             decoders=state.decoders,
             session=work.session_for(rows),
-            target=target,
-            views=views,
-            pixels=frame.cameras.width * frame.cameras.height,
-            generator=generator,
-            step_scale=1.0 if tools.budget is None else tools.budget.step_scale,
+            target=(work.everywhere() if scope is Scope.ALL else work).residual_target,
+            cameras=frame.cameras,
+            generator=rng.stream("frame", frame.index),
+            step_scale=budget.step_scale,
         )
-        schedule = scheduled(stream, frame, tools.budget)
         solution = optimise(assembly, problem, schedule)
         residual = quantise_residual(assembly, problem, solution)
     with log.phase("growth"):
         delta = with_growth(assembly, state, Delta(motions).with_residual(residual), work=work, rng=rng)
     with log.phase("code"):
-        most = None if tools.budget is None else tools.budget.max_bytes
-        fitted = encode_frame(
-            delta, state.player, frame.index, solution=solution, trim=assembly.recipe.codec.trim, budget=most
-        )
+        trim, most = assembly.recipe.codec.trim, budget.max_bytes
+        fitted = encode_frame(delta, state.player, frame.index, solution=solution, trim=trim, max_bytes=most)
         player = decode_packet(state.player, fitted.packet.data)
     with log.phase("keep"):
         # A frame that changed nothing is not what the scene shows: the next one is compared with the last that did, so
@@ -95,10 +88,9 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
         session, resident = keep(work, scene, fitted.delta, player)
         kept = replace(state, previous=shown, session=session, resident=resident)
         after = next_state(assembly.motion, kept, player, rng)
-    log_packet(log, player, fitted.packet)
     log.set(changed_tiles=1.0 if change is None else change.share, **step_numbers(solution, len(rows), session))
-    if tools.budget is not None and (len(rows) or scope is Scope.NONE):
-        log.set(budget=usage(schedule, fitted))
+    if budget.is_limited and (len(rows) or scope is Scope.NONE):
+        log.set(budget=schedule.usage(fitted))
     return Step(after, replace(fitted.packet, decoded=player), "empty" if unchanged else "delta")
 
 

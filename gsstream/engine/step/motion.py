@@ -52,7 +52,7 @@ def propose_motion(
         frame=frame,
         log=tools.log,
         change=change,
-        part_scale=1.0 if budget is None else budget.part_scale,
+        part_scale=budget.part_scale,
         images=images,
     )
     proposed = assembly.motion.propose(scene, work, tools.rng, state.motion_memory)
@@ -63,7 +63,7 @@ def propose_motion(
         delta = Delta(motions)
         # What cannot be sent is refused before anything is learned on it.
         sections = encode_motions(delta.motions) + ([] if delta.field is None else encode_field(delta.field))
-        most = None if budget is None else budget.max_bytes
+        most = budget.max_bytes
         share = 1.0 if assembly.update.scope(frame.index) is Scope.NONE else MAX_SIZE_SHARE
         if most is not None and sum(len(data) for _, data in sections) > share * most:
             return Moved((), scene, work)

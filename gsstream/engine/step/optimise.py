@@ -1,7 +1,18 @@
 """Optimise one frame's gates and residuals. Only candidates take part.
 
-An iteration samples the gates, renders a view with the residual behind them, differentiates the loss, and steps:
-``ResidualOptimiser.run`` is its body.
+:func:`optimise` makes passes over the training cameras. What it does with the views of a pass is
+``ResidualOptimiser.run``, whose body is this::
+
+    for view, target, frozen, lr_factor in iterations:
+        gates = trained_gates.sample(frozen)                    # noise, where the gate part has some
+        rows = base + gates * (latents @ decoders)              # forward: the residual behind its gates
+        loss, d_rows = session.loss_and_grad(view, target, rows)    # render, compare, differentiate
+        d_gates = backward(d_rows, rd_lambda)                   # to latents, decoders and gates; bits have a price
+        trained_gates.step(gates, d_gates, frozen)              # and the penalty on open gates
+        adam.step(latents, decoders, lr_factor)
+
+On a processor the compiled backend runs the same iterations in one call, in C++
+(``plugins/cpu_render/src/cpp/fit/residual_pass.cpp``), where it knows the gate and the penalty in closed form.
 """
 
 from __future__ import annotations
@@ -18,8 +29,7 @@ from gsstream.core.picture_size import bit_price_factor
 from gsstream.core.shapes import IntArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import Checks
-from gsstream.engine.budget.epoch_scheduler import estimated_bytes
-from gsstream.engine.budget.schedule import Schedule
+from gsstream.engine.budget.epoch_scheduler import EpochScheduler, estimated_bytes
 from gsstream.engine.fit.constants import GATE_LR
 from gsstream.engine.fit.gates import TrainedGates
 from gsstream.engine.step.active.candidates import keep_mask
@@ -34,38 +44,22 @@ from gsstream.recipe.model import Stream
 MAX_RETAINED_SHARE = 0.9
 
 
-def optimise(assembly: Assembly, problem: Problem, schedule: Schedule) -> Solution:
-    """Minimise photometric loss + penalty + rate over the epochs of the schedule, one view per iteration.
-
-    After every epoch rows whose gate has closed leave, but where the recipe lets everything take part.
-    """
+def optimise(assembly: Assembly, problem: Problem, schedule: EpochScheduler) -> Solution:
+    """Minimise photometric loss + penalty + rate over the passes of the schedule, one view per iteration."""
     if len(problem.rows) == 0:
         return Solution(problem.rows.cpu(), {}, {}, problem.logits.cpu())
-    fit, views, done, losses = _Fit(assembly, problem, schedule), problem.views, 0, list[torch.Tensor]()
-    schedule.start(len(problem.rows))
-    while done < schedule.epochs:
-        losses, some = [], schedule.chunk or views
-        # Reversed, because older versions took views from the end of the list: so equal seeds still give equal bytes.
-        order = torch.randperm(views, generator=problem.generator).tolist()[::-1]
-        for begin in range(0, views, some):
-            losses += fit.run(order[begin : begin + some], done * views + begin)
-            if schedule.is_over():
-                return fit.solution(losses, done * views + len(losses))
-        done += 1
-        schedule.end_epoch(done)
-        fit.open_gates.append(int(fit.opened().sum()))
-        if assembly.recipe.stream.change_threshold > 0 and done < schedule.epochs:
-            fit.release(done / schedule.epochs)
-            if len(fit.rows) == 0:
-                break
-        schedule.weigh_bytes(done, fit.estimated_bytes)
-    return fit.solution(losses, done * views)
+    fit, losses = _Fit(assembly, problem, schedule), list[torch.Tensor]()
+    while schedule.goes_on and len(fit.rows):
+        losses = [loss for views in schedule.next_pass(fit.order()) for loss in fit.run(views)]
+        if not schedule.is_cut:
+            fit.end_pass()
+    return fit.solution(losses)
 
 
 class _Fit:
     """The moving state of one frame's optimisation; lives only inside :func:`optimise`."""
 
-    def __init__(self, assembly: Assembly, problem: Problem, schedule: Schedule) -> None:
+    def __init__(self, assembly: Assembly, problem: Problem, schedule: EpochScheduler) -> None:
         self.assembly, self.problem, self.schedule, self.rows = assembly, problem, schedule, problem.rows
         layout, index, device = problem.layout, problem.rows.cpu().numpy(), problem.rows.device
         self.levels = torch.from_numpy(layout.unit_of[index].astype("int64")).to(device)
@@ -87,24 +81,40 @@ class _Fit:
             rows=problem.rows,
             generator=problem.generator,
         )
-        self.open_gates: list[int] = []
+        self.iterations, self.open_gates = 0, list[int]()
 
-    def run(self, order: Sequence[int], first: int) -> list[torch.Tensor]:
-        """Make one iteration on each of these views, the first with this number; return the photometric losses."""
-        total, final = self.schedule.epochs * self.problem.views, self.assembly.recipe.stream.lr_final_factor
+    def order(self) -> list[int]:
+        """Return the views in the order of the next pass."""
+        # Reversed, because older versions took views from the end of the list: so equal seeds still give equal bytes.
+        return torch.randperm(len(self.problem.cameras), generator=self.problem.generator).tolist()[::-1]
+
+    def run(self, views: Sequence[int]) -> list[torch.Tensor]:
+        """Make one iteration on each of these views; return the photometric losses."""
+        cameras, final, first = self.problem.cameras, self.assembly.recipe.stream.lr_final_factor, self.iterations
+        total, pixels = self.schedule.epochs * len(cameras), cameras.width * cameras.height
         iterations = [
             Iteration(view, self.problem.target(view), self.frozen(number / total), lr_factor(final, number, total))
-            for number, view in enumerate(order, first)
+            for number, view in enumerate(views, first)
         ]
-        price = self.schedule.rd_lambda * bit_price_factor(self.problem.pixels) / self.problem.pixels
+        price = self.schedule.rd_lambda * bit_price_factor(pixels) / pixels
         begin = partial(self.assembly.where.iterate, first)
         self.gates.draw_ahead(len(iterations))
+        self.iterations += len(iterations)
         with deferred_checks(self.assembly.checks is not Checks.STEP):
             return self.residual.run(
                 ResidualEpoch(
                     session=self.problem.session, iterations=iterations, gates=self.gates, rd_lambda=price, begin=begin
                 )
             )
+
+    def end_pass(self) -> None:
+        """Let go of rows whose gate has closed, but where the recipe lets everything take part; weigh the bytes."""
+        schedule = self.schedule
+        self.open_gates.append(int(self.opened().sum()))
+        if schedule.budget.change_threshold > 0 and schedule.goes_on:
+            self.release(schedule.done / schedule.epochs)
+        if len(self.rows):
+            schedule.weigh_bytes(self.estimated_bytes)
 
     def frozen(self, fraction: float) -> torch.Tensor | None:
         """[A] bool: rows whose level is not trained yet at this share of the frame; None: all take part."""
@@ -131,18 +141,17 @@ class _Fit:
         latents = self.residual.latents.detach()[opened[self.gates.node_of]]
         return estimated_bytes(torch.round(latents / self.code.steps)) + float(opened.sum())
 
-    def solution(self, losses: Sequence[torch.Tensor], iterations: int) -> Solution:
-        """What was found after so many iterations, and the mean of these losses."""
+    def solution(self, losses: Sequence[torch.Tensor]) -> Solution:
+        """What was found, and the mean of these losses."""
         dead = count_dead_gates(self.assembly.gate, self.gates.logits)
         self.assembly.where.pause()
-        self.schedule.finish()
         return Solution(
             rows=self.rows.cpu(),
             latents=self.code.split(self.residual.latents.detach().cpu()),
             decoders=self.code.split_decoders(self.residual.matrix.cpu(), self.decoders),
             logits=self.gates.all_logits().cpu(),
             loss=sum(torch.stack(list(losses)).cpu().tolist()) / len(losses),
-            iterations=iterations,
+            iterations=self.iterations,
             curvature=self.code.split(self.residual.curvature.cpu()),
             dead_gates=dead,
             open_gates=self.open_gates,

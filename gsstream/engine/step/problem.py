@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import torch
 
+from gsstream.core.cameras import Cameras
 from gsstream.core.changes import Layout
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
@@ -27,8 +28,7 @@ class Problem:
     decoders: Mapping[str, torch.Tensor]  # attribute -> [L, D] linear decoder to go on from
     session: RenderSession  # a render session in which only ``rows`` change
     target: Callable[[int], ViewTarget]  # view -> what its render is compared with in the next iteration
-    views: int  # training cameras; pixels: of one view
-    pixels: int
+    cameras: Cameras  # the training cameras
     generator: torch.Generator  # of noise and of the order of views
     step_scale: float = 1.0  # factor on the update rule's quantisation steps
 

@@ -89,15 +89,15 @@ def gather_rows_or_zero(values: np.ndarray[Any, Any], known: IntArray, wanted: I
 
 
 def encode_frame(
-    delta: Delta, before: PlayerState, frame: int, solution: Solution, trim: float, budget: int | None = None
+    delta: Delta, before: PlayerState, frame: int, solution: Solution, trim: float, max_bytes: int | None = None
 ) -> TrimmedDelta:
-    """Return the delta and its packet, made to fit ``budget``, else less the share ``trim``."""
+    """Return the delta and its packet, made to fit ``max_bytes``, else less the share ``trim``."""
     # Packets of the same motions are made several times, and motions are never trimmed.
     motions = delta.motions
     encoded = partial(delta_packet, before, frame=frame, known=(motions, encode_motions(motions)))
     packet = encoded(delta)
     whole = TrimmedDelta(delta, packet, len(packet.data))
-    limit = budget or _share(delta, encoded, whole.untrimmed, trim)
+    limit = max_bytes or _share(delta, encoded, whole.untrimmed, trim)
     if whole.untrimmed <= limit:
         return whole
     curvature = {}
@@ -108,7 +108,7 @@ def encode_frame(
     # Where only a share is asked for, a packet is not trimmed to nothing: one that is mostly headers would lose all of
     # its change for a few bytes.
     lost = found.delta.is_empty or found.delta.has_row_edit != delta.has_row_edit
-    return whole if budget is None and lost else found
+    return whole if max_bytes is None and lost else found
 
 
 def _share(delta: Delta, encoded: Callable[[Delta], EncodedPacket], size: int, trim: float) -> int:

@@ -13,12 +13,12 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.log import FrameLog
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.budget.epoch_scheduler import Allowance
 from gsstream.engine.frame0.begin import begin, exposure_from_meta
 from gsstream.engine.frame0.optimise import Progress
 from gsstream.engine.frame0.reuse import reuse_first_frame
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.context import EngineContext
+from gsstream.method.budget import FrameBudget
 from gsstream.method.tools import FirstFrame
 from gsstream.packet import PlayerState, StreamMeta
 from gsstream.parts.render.base import Renderer
@@ -36,10 +36,10 @@ class RunTools:
     rng: Rng  # random streams by name and frame
     meta: Callable[[Frame], StreamMeta]  # makes what a key packet says about the run, from the frame that is to be sent
     points: Callable[[Frame], PointCloud]  # makes the seeds of frame 0, from its training images
+    budget: FrameBudget  # what the frame may cost
     log: FrameLog = field(default_factory=FrameLog)  # the record of the frame
     first: PlayerState | None = None  # frame 0 of another stream, to be taken over; or None
     progress: Progress = lambda *_: None  # told about the iterations of frame 0
-    budget: Allowance | None = None  # what the frame may spend; None: what the recipe says
     #: Number of Gaussians -> why a key packet cannot be paid for now, or None.
     key_refusal: Callable[[int], str | None] = lambda _: None
     #: The states of players since the last key packet, while a stream is being resumed.
@@ -56,8 +56,7 @@ class RunTools:
         return self.assembly.background
 
     def epochs(self, frame: Frame) -> int:
-        epochs = self.assembly.recipe.stream.epochs if self.budget is None else self.budget.epochs
-        return max(1, round(epochs * frame.epoch_scale))
+        return max(1, round(self.budget.epochs * frame.epoch_scale))
 
     def since_key(self) -> Iterator[PlayerState]:
         return self.replay()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,8 @@ from gsstream_cpu_render.residual import CpuResidualOptimiser
 from gsstream.core.errors import ComponentError
 from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.budget.schedule import Schedule
+from gsstream.engine.budget.epoch_scheduler import EpochScheduler
+from gsstream.engine.budget.plan import unlimited
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.step import frame_step
@@ -53,7 +54,7 @@ def captured(method: str, settings: tuple[str, ...]) -> tuple[Assembly, Problem]
     parts = assemble(resolve_recipe(method, catalog.recipe_path, (), overrides), catalog)
     source = open_source(SOURCE)
 
-    def noted(parts: Assembly, problem: Problem, schedule: Schedule) -> Solution:
+    def noted(parts: Assembly, problem: Problem, schedule: EpochScheduler) -> Solution:
         found.append(problem)
         return optimise(parts, problem, schedule)
 
@@ -71,14 +72,17 @@ def captured(method: str, settings: tuple[str, ...]) -> tuple[Assembly, Problem]
     return parts, replace(problem, session=session)
 
 
-def solved(parts: Assembly, problem: Problem, schedule: Schedule | None = None) -> Solution:
+def solved(parts: Assembly, problem: Problem, schedule: EpochScheduler | None = None) -> Solution:
     problem.session.narrow(problem.rows)
     problem.generator.manual_seed(7)
-    stream = parts.recipe.stream
-    return optimise(parts, problem, schedule or Schedule(stream.epochs, stream.rd_lambda))
+    return optimise(parts, problem, schedule or EpochScheduler(unlimited(parts.recipe.stream), *counts(problem)))
 
 
-def one_by_one(parts: Assembly, problem: Problem, schedule: Schedule | None = None) -> Solution:
+def counts(problem: Problem) -> tuple[int, int]:
+    return len(problem.cameras), len(problem.rows)
+
+
+def one_by_one(parts: Assembly, problem: Problem, schedule: EpochScheduler | None = None) -> Solution:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(CpuResidualOptimiser, "_native_run", lambda *_: [])
         return solved(parts, problem, schedule)
@@ -133,13 +137,12 @@ def test_factors_of_tiles_count_in_one_call_as_in_single_calls() -> None:
     assert found.loss != solved(parts, problem).loss
 
 
-class FirstIteration(Schedule):
+class FirstIteration(EpochScheduler):
     """Over after one iteration: the finer half of the levels has not had its turn."""
 
-    chunk = 1
-
-    def is_over(self) -> bool:
-        return True
+    def next_pass(self, order: Sequence[int]) -> Iterator[Sequence[int]]:
+        yield order[:1]
+        self.is_cut = True
 
 
 @pytest.mark.parametrize("solve", [solved, one_by_one])
@@ -150,7 +153,7 @@ def test_nothing_moves_a_gate_whose_level_waits(solve: Callable[..., Solution], 
     present = levels.unique()
     assert len(present) > 2, "a scene of several levels"
     calls.clear()
-    found = solve(parts, problem, FirstIteration(4, 0.0))
+    found = solve(parts, problem, FirstIteration(unlimited(parts.recipe.stream), *counts(problem)))
     assert sum(calls) == (solve is solved), "the loop is the compiled one, or the one of single calls"
     moved = (found.logits != problem.logits)[problem.hierarchy.node_of[problem.rows]]
     waits = levels > present[len(present) // 2]
@@ -161,13 +164,18 @@ def test_nothing_moves_a_gate_whose_level_waits(solve: Callable[..., Solution], 
 def test_open_gates_are_counted_after_every_epoch() -> None:
     """As many as frames of one, two and three epochs end with."""
     parts, problem = captured("s2gs-paper", ("gate.noise=none",))
-    found = solved(parts, problem, Schedule(3, 0.0))
+
+    def of_epochs(number: int) -> EpochScheduler:
+        budget = replace(unlimited(parts.recipe.stream), epochs=number, rd_lambda=0.0)
+        return EpochScheduler(budget, *counts(problem))
+
+    found = solved(parts, problem, of_epochs(3))
     assert found.open_gates[0] > found.open_gates[-1] > 0
     present = problem.hierarchy.node_of[problem.rows].unique()
     final = parts.gate.sample(found.logits[present], None)
     assert found.open_gates[-1] == int((final > 0).sum())
     assert len(found.open_gates) == 3
-    assert solved(parts, problem, Schedule(1, 0.0)).open_gates == found.open_gates[:1]
+    assert solved(parts, problem, of_epochs(1)).open_gates == found.open_gates[:1]
 
 
 def faulty(change: Callable[[Problem], None], calls: list[int]) -> None:

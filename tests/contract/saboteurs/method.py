@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from gsstream.core.frame import Frame
+from gsstream.engine.run.encoder import EncodedFrame
 from gsstream.input.recordings.open import open_source
-from gsstream.method.base import Step
 from gsstream.packet import KeyState, PlayerState, decode_packet, encode_key
 from gsstream.testing.cases import fingerprint
 from gsstream.testing.method_driver import FRAMES, SOURCE, MethodUnderTest
@@ -23,15 +23,15 @@ METHOD_SABOTEURS: dict[str, type[MethodUnderTest]] = {}
 class Remembered(MethodUnderTest):
     """A sound method that encodes each frame once for all saboteurs: what they spoil lies around it."""
 
-    memory: ClassVar[dict[bytes, Step[Any]]] = {}
+    memory: ClassVar[dict[bytes, EncodedFrame]] = {}
 
-    def begin(self, frame: Frame, uri: str = SOURCE) -> Step[Any]:
+    def begin(self, frame: Frame, uri: str = SOURCE) -> EncodedFrame:
         key = b"".join([uri.encode(), *fingerprint(frame)])
         if key not in self.memory:
             self.memory[key] = super().begin(frame, uri)
         return self.memory[key]
 
-    def step(self, state: Any, frame: Frame) -> Step[Any]:
+    def step(self, state: Any, frame: Frame) -> EncodedFrame:
         seen = (state.player.gaussians, state.previous, frame)
         key = b"".join([*fingerprint(seen), str(frame.epoch_scale).encode()])
         if key not in self.memory:
@@ -63,7 +63,7 @@ class Moody(Remembered):
 
     runs = 0
 
-    def begin(self, frame: Frame, uri: str = SOURCE) -> Step[Any]:
+    def begin(self, frame: Frame, uri: str = SOURCE) -> EncodedFrame:
         step = super().begin(frame, uri)
         self.runs += 1
         if self.runs == 1:
@@ -87,9 +87,9 @@ class Amnesiac(Remembered):
 class Clumsy(Remembered):
     """A failure spoils the state."""
 
-    memory: ClassVar[dict[bytes, Step[Any]]] = {}
+    memory: ClassVar[dict[bytes, EncodedFrame]] = {}
 
-    def step(self, state: Any, frame: Frame) -> Step[Any]:
+    def step(self, state: Any, frame: Frame) -> EncodedFrame:
         try:
             return super().step(state, frame)
         except Exception:
@@ -101,7 +101,7 @@ class Clumsy(Remembered):
 class Nervous(Remembered):
     """Sends most when nothing moves."""
 
-    def step(self, state: Any, frame: Frame) -> Step[Any]:
+    def step(self, state: Any, frame: Frame) -> EncodedFrame:
         step = super().step(state, frame)
         if not np.array_equal(frame.images, state.previous.images):
             return step
@@ -112,7 +112,7 @@ class Nervous(Remembered):
 class Stereo(Remembered):
     """Needs two cameras."""
 
-    def step(self, state: Any, frame: Frame) -> Step[Any]:
+    def step(self, state: Any, frame: Frame) -> EncodedFrame:
         if len(frame.cameras) < 2:
             raise ValueError("expected at least two cameras")
         return super().step(state, frame)
@@ -122,7 +122,7 @@ class Stereo(Remembered):
 class Optimist(Remembered):
     """Starts without a camera, from what it has seen before."""
 
-    def begin(self, frame: Frame, uri: str = SOURCE) -> Step[Any]:
+    def begin(self, frame: Frame, uri: str = SOURCE) -> EncodedFrame:
         return super().begin(frame, uri) if len(frame.cameras) else super().begin(open_source(uri).frame(0), uri)
 
 
@@ -130,7 +130,7 @@ class Optimist(Remembered):
 class Boaster(Remembered):
     """Reports half of the bytes."""
 
-    def step(self, state: Any, frame: Frame) -> Step[Any]:
+    def step(self, state: Any, frame: Frame) -> EncodedFrame:
         step = super().step(state, frame)
         sizes = {name: size // 2 for name, size in step.packet.sizes.items()}
         return replace(step, metrics={**step.metrics, "bytes": sizes})
@@ -140,7 +140,7 @@ class Boaster(Remembered):
 class Gambler(Remembered):
     """Draws from the global generator."""
 
-    def step(self, state: Any, frame: Frame) -> Step[Any]:
+    def step(self, state: Any, frame: Frame) -> EncodedFrame:
         torch.rand(1)
         return super().step(state, frame)
 
@@ -149,7 +149,7 @@ class Gambler(Remembered):
 class Scribbler(Remembered):
     """Darkens the images of the last frame once it is done with them."""
 
-    def step(self, state: Any, frame: Frame) -> Step[Any]:
+    def step(self, state: Any, frame: Frame) -> EncodedFrame:
         step = super().step(state, frame)
         if frame.index == FRAMES - 1:
             frame.images[...] *= np.float32(0.5)
@@ -160,7 +160,7 @@ class Scribbler(Remembered):
 class Stubborn(Remembered):
     """Reconstructs frame 0 although it was given one."""
 
-    def take_over(self, first: PlayerState, frame: Frame) -> Step[Any]:
+    def take_over(self, first: PlayerState, frame: Frame) -> EncodedFrame:
         return self.begin(frame)
 
 
@@ -168,7 +168,7 @@ class Stubborn(Remembered):
 class Impostor(Remembered):
     """Signs its stream with another method's name."""
 
-    def begin(self, frame: Frame, uri: str = SOURCE) -> Step[Any]:
+    def begin(self, frame: Frame, uri: str = SOURCE) -> EncodedFrame:
         step = super().begin(frame, uri)
         player = step.state.player
         meta = replace(player.meta, method="somebody-else")
@@ -181,5 +181,5 @@ class Impostor(Remembered):
 class Workaholic(Remembered):
     """Does every frame in full, whatever it is worth."""
 
-    def step(self, state: Any, frame: Frame) -> Step[Any]:
+    def step(self, state: Any, frame: Frame) -> EncodedFrame:
         return super().step(state, replace(frame, epoch_scale=1.0))

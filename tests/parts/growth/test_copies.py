@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsstream.method.base import Step
+from gsstream.engine.run.encoder import EncodedFrame
 from gsstream.parts.growth.copying import Copies
 from gsstream.parts.update.none import NoUpdate
 from gsstream.testing import MethodUnderTest
 
 
-def steps_with(**settings: Any) -> list[Step[Any]]:
+def steps_with(**settings: Any) -> list[EncodedFrame]:
     method = MethodUnderTest("dense")
     config = Copies.Config.model_validate({"gradient": 1e-7, "rounds": 1, "most": 7, "prune_opacity": 0.0, **settings})
     method.assembly = replace(method.assembly, growth=Copies(config), update=NoUpdate())

@@ -9,8 +9,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
 
+from gsstream.engine.run.encoder import EncodedFrame
 from gsstream.engine.run.session import RunListener
-from gsstream.method.base import Step
 
 #: A rail that holds all the others of its board (Jetson modules): not added to them.
 WHOLE_MODULE = "VDD_IN"
@@ -200,7 +200,7 @@ class FrameEnergy(RunListener):
     def before(self) -> None:
         self._before = self._meter.read()
 
-    def after(self, step: Step[Any]) -> Mapping[str, Any]:
+    def after(self, step: EncodedFrame) -> Mapping[str, Any]:
         if not self._before:
             return {}
         return {"joules": {name: value - self._before[name] for name, value in self._meter.read().items()}}

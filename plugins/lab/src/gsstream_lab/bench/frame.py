@@ -23,8 +23,8 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.discovery.catalog import Catalog
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.run.encoder import Encoder
-from gsstream.engine.state.stream_state import Step, StreamState
+from gsstream.engine.run.encoder import EncodedFrame, Encoder
+from gsstream.engine.state.stream_state import StreamState
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.metrics import peak_memory_mb, psnr
 from gsstream.packet import KeyState, PlayerState, StreamMeta, decode_packet, encode_key
@@ -263,12 +263,12 @@ def _changed_share(before: FloatArray, after: FloatArray) -> float:
 
 def _timed(
     plan: FramePlan, assemblies: Mapping[str, Assembly], cases: Mapping[str, _Case]
-) -> Sequence[tuple[str, Step, dict[str, Any]]]:
+) -> Sequence[tuple[str, EncodedFrame, dict[str, Any]]]:
     """Every variant's step in turn, several times over: (variant, last step, ms of the whole and by phase)."""
     total: dict[str, list[float]] = {name: [] for name in assemblies}
     work: dict[str, list[float]] = {name: [] for name in assemblies}
     phases: dict[str, dict[str, list[float]]] = {name: {} for name in assemblies}
-    last: dict[str, Step] = {}
+    last: dict[str, EncodedFrame] = {}
     for round_ in range(plan.warm_up + plan.repetitions):
         for name, parts in assemblies.items():
             state = mid_stream_state(parts, cases[name].state, last.get(name))
@@ -291,7 +291,7 @@ def _timed(
     return out
 
 
-def _outcome(parts: Assembly, case: _Case, step: Step) -> dict[str, Any]:
+def _outcome(parts: Assembly, case: _Case, step: EncodedFrame) -> dict[str, Any]:
     """What the frame became: how much took part, what it weighs, how close it comes to the frame without noise."""
     shown = _draw(parts, step.state.player.gaussians, case.frame.cameras)
     stood = _draw(parts, case.state.player.gaussians, case.frame.cameras)

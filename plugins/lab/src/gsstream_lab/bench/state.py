@@ -7,10 +7,11 @@ from dataclasses import replace
 import torch
 
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.state.stream_state import Step, StreamState
+from gsstream.engine.run.encoder import EncodedFrame
+from gsstream.engine.state.stream_state import StreamState
 
 
-def mid_stream_state(parts: Assembly, state: StreamState, last: Step | None) -> StreamState:
+def mid_stream_state(parts: Assembly, state: StreamState, last: EncodedFrame | None) -> StreamState:
     """Return the state in the middle of a stream: with the caches that this variant's own step leaves behind.
 
     A step hands its session's caches on to the next scene, so each repetition needs them anew.

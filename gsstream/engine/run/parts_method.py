@@ -8,7 +8,6 @@ from typing import Any, ClassVar, final
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.budget.controller import apply_plan
 from gsstream.engine.frame0.begin import begin
 from gsstream.engine.frame0.refine import refine_first_frame, runs_after_packet
 from gsstream.engine.frame0.reuse import reuse_first_frame
@@ -50,13 +49,11 @@ class PartsMethod(StreamingMethod[StreamState]):
         return make(self.slots, frame, tools)
 
     def step(self, state: StreamState, frame: Frame, tools: Tools) -> Step:
-        parts = self.slots if tools.budget is None else apply_plan(self.slots, tools.budget)
-        step = frame_step(parts, state, frame, tools)
-        if runs_after_packet(parts.recipe.stream, state, frame):
+        step = frame_step(self.slots, state, frame, tools)
+        if runs_after_packet(self.slots.recipe.stream, state, frame):
             return step  # no key packet is due before the last iteration of the refinement
-        return key_packet_if_due(
-            self.slots, refine_first_frame(self.slots, state, step, frame=frame, tools=tools), frame, tools
-        )
+        refined = refine_first_frame(self.slots, state, step, frame=frame, tools=tools)
+        return key_packet_if_due(self.slots, refined, frame, tools)
 
     def follow_up(self, state: StreamState, step: Step, frame: Frame, tools: Tools) -> Step:
         if not runs_after_packet(self.slots.recipe.stream, state, frame):

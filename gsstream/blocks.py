@@ -13,7 +13,6 @@ from gsstream.core.changes.motion import transform_groups as transform_groups
 from gsstream.core.changes.rows import gather_rows as gather_rows
 from gsstream.core.picture_size import bit_price_factor as bit_price_factor
 from gsstream.core.picture_size import enlargement as enlargement
-from gsstream.engine.budget.trim import TrimmedDelta as TrimmedDelta
 from gsstream.engine.fit.densify import SPLIT_SIZE as SPLIT_SIZE
 from gsstream.engine.fit.densify import DensifyStatistics as DensifyStatistics
 from gsstream.engine.fit.densify import split_or_clone as split_or_clone

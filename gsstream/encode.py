@@ -5,8 +5,8 @@
     from gsstream.encode import encode, open_recording
 
     with open_recording("demo") as source:
-        for step in encode("s2gs-edge", source, {"frames": 3}, out="demo.gss"):
-            print(step.status, len(step.packet.data))
+        for frame in encode("s2gs-edge", source, {"frames": 3}, out="demo.gss"):
+            print(frame.status, len(frame.packet.data))
 
 :func:`encoder_for` gives the encoder alone, for frames in a loop of your own.
 A method is also composed: parts that are given, live or by name, take the places of those in the recipe of a method.
@@ -141,8 +141,8 @@ def encode(
     out: str | os.PathLike[str] | None = None,
     listeners: Callbacks | None = None,
     **parts: Unpack[Parts],
-) -> Iterator[Step[Any]]:
-    """Return an iterator that encodes a recording, one frame for each :class:`Step` that it yields.
+) -> Iterator[EncodedFrame]:
+    """Return an iterator that encodes a recording, and yields an :class:`EncodedFrame` for each of its frames.
 
     The iterator ends with the recording, or after as many frames as the setting ``frames`` says. A loop that is left
     early leaves a whole stream of the frames so far.
@@ -151,17 +151,17 @@ def encode(
         method: a name of ``gsstream methods``.
         source: an open recording, as for :func:`encoder_for`.
         settings: as for :func:`recipe_for`.
-        out: file of the stream, which must not exist; every packet is in it before its step is yielded. None: no file.
+        out: file of the stream, which must not exist; every packet is in it before its frame is yielded. None: no file.
         listeners: as for :func:`encoder_for`.
         parts: as for :func:`encoder_for`.
 
     Raises what :func:`encoder_for` raises at once, and while it is iterated what :meth:`Encoder.encode` raises, and
     SourceError for a frame that cannot be read.
     """
-    return _steps(encoder_for(method, source, settings, listeners, **parts), source, out)
+    return _encoded(encoder_for(method, source, settings, listeners, **parts), source, out)
 
 
-def _steps(encoder: Encoder, source: FrameSource, out: str | os.PathLike[str] | None) -> Iterator[Step[Any]]:
+def _encoded(encoder: Encoder, source: FrameSource, out: str | os.PathLike[str] | None) -> Iterator[EncodedFrame]:
     with nullcontext() if out is None else StreamWriter.open(out) as writer:
         for index in itertools.islice(itertools.count(), encoder.assembly.recipe.frames):
             if index == source.info.num_frames:  # asked each time: a recording that grows may end
@@ -170,11 +170,11 @@ def _steps(encoder: Encoder, source: FrameSource, out: str | os.PathLike[str] | 
                 frame = source.frame(index)
             except EndOfRecording:
                 return
-            step = encoder.encode(frame)
+            encoded = encoder.encode(frame)
             if writer is not None:
-                writer.append(step.packet)
+                writer.append(encoded.packet)
             try:
-                yield step
+                yield encoded
             except GeneratorExit:  # the loop was left: the writer ends the file as after the last frame
                 return
 

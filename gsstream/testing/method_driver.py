@@ -114,7 +114,7 @@ class MethodUnderTest:
         return self.chain()
 
 
-def check_replay(method: MethodUnderTest, steps: Sequence[Step[Any]]) -> None:
+def check_replay(method: MethodUnderTest, steps: Sequence[EncodedFrame]) -> None:
     """Raise AssertionError unless a player that is given the packets alone has the state of every step, bit by bit.
 
     Compared are the Gaussians, their layout, decoders, and the displacement and groups that later motions start from.

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from statistics import mean
 from typing import Any
 
 import torch
 
+from gsstream.core.changes import Layout
 from gsstream.engine.budget.plan import (
     MAX_TRIMMED,
     MAX_WEIGHT,
@@ -40,23 +41,36 @@ class EpochScheduler:
 
     def __init__(self, budget: FrameBudget, views: int, candidates: int, epoch_scale: float = 1.0) -> None:
         self.budget, self._views, self._epoch_scale = budget, views, epoch_scale
-        self.epochs, self.done = max(1, round(budget.epochs * epoch_scale)), 0
-        self.rd_lambda, self.estimate, self._weights = budget.rd_lambda, 0.0, list[float]()
+        #: Whether there is a limit on time; on bytes.
+        self.timed, self.sized = budget.seconds is not None, budget.max_bytes is not None
+        self.epochs, self.done, self.rd_lambda = max(1, round(budget.epochs * epoch_scale)), 0, budget.rd_lambda
         #: Whether the clock allows fewer passes than there could be; whether it has ended one in the middle.
         self.stopped_by_clock = self.is_cut = False
-        self._piece_began, self._pieces = budget.clock(), list[float]()
-        #: Seconds until the optimisation began, and of it, by the budget's clock.
-        self.before, self.optimise = self._piece_began - budget.started, 0.0
-        if budget.seconds is None:
-            return
-        self._seconds = budget.seconds
-        # With a limit on time the number of passes is a prediction, and the clock may allow more.
-        self._most = max(self.epochs, round(epoch_scale * budget.max_epochs))
+        #: When the optimisation began and when its last piece has ended, by the budget's clock.
+        self._began = self._read = budget.clock()
+        self._seconds_of_views, self._weights, self._estimate = list[float](), list[float](), 0.0
+        if budget.seconds is not None:
+            self._plan_by_clock(candidates, budget.seconds)
+
+    def _plan_by_clock(self, candidates: int, seconds: float) -> None:
+        """With a limit on time the number of passes is a prediction, and the clock may allow more."""
+        budget, self._seconds = self.budget, seconds
+        self._most = max(self.epochs, round(self._epoch_scale * budget.max_epochs))
         # The phases before the passes render every view once, forwards and backwards. Without earlier frames to go by,
         # their time is the estimate of a pass.
         each = budget.each
         self._each = self.before if each is None else scale_epoch_seconds(each, budget.candidates, candidates)
         self.epochs = epochs_in(self._left(), self._each, self._most)
+
+    @property
+    def before(self) -> float:
+        """Seconds of the frame until its optimisation began."""
+        return self._began - self.budget.started
+
+    @property
+    def optimise(self) -> float:
+        """Seconds of the passes."""
+        return self._read - self._began
 
     @property
     def goes_on(self) -> bool:
@@ -65,31 +79,29 @@ class EpochScheduler:
 
     def next_pass(self, order: Sequence[int]) -> Iterator[Sequence[int]]:
         """Yield the views of a pass in this order: one by one, until the clock ends it, under a limit on time."""
-        timed = self.budget.seconds is not None
-        some = 1 if timed else len(order)
+        some = 1 if self.timed else len(order)
         for begin in range(0, len(order), some):
             yield order[begin : begin + some]
-            self._measure()
-            if timed and self._is_late():
+            before, self._read = self._read, self.budget.clock()
+            if self.timed and self._is_late(self._read - before):
                 self.is_cut = self.stopped_by_clock = True
                 return
         self.done += 1
-        if timed:
+        if self.timed:
             self._plan_rest()
 
-    def weigh_bytes(self, estimate: Callable[[], float]) -> None:
-        """Move the weight of the rate by what a pass would have sent, where a size is to be met.
+    def weigh_bytes(self, estimate: float) -> None:
+        """Move the weight of the rate by the bytes that a pass would have sent, before their correction.
 
-        ``estimate``: bytes, before the correction; it is called only where a size is to be met.
+        Without a limit on bytes it stays.
         """
-        limit = self.budget.max_bytes
-        if limit is None:
+        if (limit := self.budget.max_bytes) is None:
             return
-        self.estimate = estimate()
+        self._estimate = estimate
         self._weights.append(self.rd_lambda)
         if self.done < SIZE_ESTIMATE_START * self.epochs:
             return
-        expected = self.estimate * self.budget.correction
+        expected = self._estimate * self.budget.correction
         # Between the two bounds the weight stays, and trimming makes the packet fit.
         wanted = min(max(expected, SIZE_TARGET * limit), MAX_TRIMMED * limit)
         self.rd_lambda = next_rate_weight(self.rd_lambda, expected, wanted)
@@ -100,23 +112,17 @@ class EpochScheduler:
         last = self._weights[len(self._weights) // 2 :] or [self.rd_lambda]
         return math.exp(sum(map(math.log, last)) / len(last)) if min(last) > 0 else self.rd_lambda
 
-    def usage(self, fitted: TrimmedDelta) -> dict[str, Any]:
+    def usage(self, fitted: TrimmedDelta, layout: Layout) -> dict[str, Any]:
         """Return what the optimisation used, and what fitting its packet gave up: raw numbers for the log."""
         return {
             "rd_lambda": self.mean_rate_weight,
-            "estimate": self.estimate,
+            "estimate": self._estimate,
             "stopped_by_clock": self.stopped_by_clock,
             "untrimmed": fitted.untrimmed,
             "before": self.before,
             "optimise": self.optimise,
-            "dropped": {"symbols": fitted.symbols, "gates": fitted.gates, "added": fitted.added},
+            "dropped": fitted.given_up(layout),
         }
-
-    def _measure(self) -> None:
-        """Note what the last piece took."""
-        now = self.budget.clock()
-        self._pieces.append(now - self._piece_began)
-        self._piece_began, self.optimise = now, now - self.budget.started - self.before
 
     def _left(self) -> float:
         """Seconds for passes since the clock was read last.
@@ -127,20 +133,21 @@ class EpochScheduler:
         kept = min(self._each, UNKNOWN_RESERVE * seconds) if after is None else after
         # A run that is behind hurries to catch up: what the passes of a hurried frame leave of its time is not theirs.
         given_up = (1 - self._epoch_scale) * (seconds - kept - self.before)
-        return self.budget.started + seconds - kept - self._piece_began - max(0.0, given_up)
+        return self.budget.started + seconds - kept - self._read - max(0.0, given_up)
 
-    def _is_late(self) -> bool:
-        """Say, after a view, whether the time for another one is gone."""
+    def _is_late(self, took: float) -> bool:
+        """Say, after a view that took so many seconds, whether the time for another one is gone."""
+        self._seconds_of_views.append(took)
         usual = self._last_pass()
-        if usual and self.budget.each is None and len(self._pieces) < self._views:
+        if usual and self.budget.each is None and len(self._seconds_of_views) < self._views:
             self._each = self._views * mean(usual)
-            made = len(self._pieces) / self._views
+            made = len(self._seconds_of_views) / self._views
             self.epochs = epochs_in(self._left() + made * self._each, self._each, self._most)
         return max(usual[-3:], default=0.0) > self._left()
 
     def _plan_rest(self) -> None:
         """Plan the passes that are left by what the last one took."""
-        self._each = self._views * mean(self._last_pass() or self._pieces)
+        self._each = self._views * mean(self._last_pass() or self._seconds_of_views)
         left = self._left()
         more = 0 if left < 0.25 * self._each else epochs_in(left, self._each, max(1, self._most - self.done))
         self.epochs = min(self.done + more, self._most)
@@ -148,7 +155,7 @@ class EpochScheduler:
 
     def _last_pass(self) -> list[float]:
         """Seconds of the views of the last pass, without the frame's first, which pays for what is made once."""
-        return self._pieces[1:][-self._views :]
+        return self._seconds_of_views[1:][-self._views :]
 
 
 def next_rate_weight(weight: float, expected: float, wanted: float) -> float:

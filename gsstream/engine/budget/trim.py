@@ -27,19 +27,25 @@ _BISECTIONS, _GATE_BITS = 24, 3.0
 
 @dataclass(frozen=True)
 class TrimmedDelta:
-    """A packet that fits, and what it gave up.
+    """A packet that fits, of a delta of which something may have been given up.
 
     Arguments:
-        untrimmed: bytes before trimming.
-        symbols, gates, added: how many were removed; symbols that moved nearer to zero count too.
+        delta: what is sent, as ``packet``.
+        packet: its packet.
+        whole: what was asked for.
+        untrimmed: bytes of the packet of ``whole``.
     """
 
     delta: Delta
     packet: EncodedPacket
+    whole: Delta
     untrimmed: int
-    symbols: int = 0
-    gates: int = 0
-    added: int = 0
+
+    def given_up(self, layout: Layout) -> dict[str, int]:
+        """Count the symbols that are not as they were, the open gates and the added Gaussians that are not sent."""
+        counts = [{"gates": _open(delta), "added": _added(delta)} for delta in (self.whole, self.delta)]
+        closed = {name: counts[0][name] - counts[1][name] for name in counts[0]}
+        return {"symbols": _changed(self.whole, self.delta, layout), **closed}
 
 
 def trim_to_size(
@@ -53,18 +59,18 @@ def trim_to_size(
     """Return the delta, with as little given up as makes its packet fit; unchanged when it fits already."""
     untrimmed = len(packet.data)
     if untrimmed <= max_bytes:
-        return TrimmedDelta(delta, packet, untrimmed)
+        return TrimmedDelta(delta, packet, delta, untrimmed)
     able = delta.residual is not None and delta.residual.symbols
     found = _trimmed(delta, packet, curvature, layout=layout, encode=encode, max_bytes=max_bytes) if able else None
     if found is None and delta.has_row_edit:
         # Added Gaussians cost most per row, so they are dropped first: without them the rest may fit.
         rest = delta.with_row_edit(None)
         plain = trim_to_size(rest, encode(rest), curvature, layout=layout, encode=encode, max_bytes=max_bytes)
-        return replace(plain, untrimmed=untrimmed, added=0 if delta.added is None else len(delta.added))
+        return replace(plain, whole=delta, untrimmed=untrimmed)
     if found is None:
         found = Delta(), encode(Delta())
     assert len(found[1].data) <= max_bytes, "an empty packet is above the budget"
-    return TrimmedDelta(*found, untrimmed, _changed(delta, found[0], layout), _open(delta) - _open(found[0]))
+    return TrimmedDelta(*found, delta, untrimmed)
 
 
 def _trimmed(
@@ -192,6 +198,10 @@ def _code_lengths(column: IntArray) -> Callable[[IntArray], FloatArray]:
 
 def _open(delta: Delta) -> int:
     return 0 if delta.residual is None else int(np.count_nonzero(delta.residual.gates))
+
+
+def _added(delta: Delta) -> int:
+    return 0 if delta.added is None else len(delta.added)
 
 
 def _changed(before: Delta, after: Delta, layout: Layout) -> int:

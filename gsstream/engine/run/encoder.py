@@ -151,8 +151,8 @@ class Encoder:
         self.controller.settle(step, budget, len(frame.cameras), log)
         log.set(cpu_seconds=time.process_time() - worked, peak_memory_mb=peak_memory_mb())
         self.state = step.state
-        metrics = {"frame": frame.index, "status": step.status, **log.entry()}
-        return EncodedFrame(step.state, step.packet, step.status, metrics)
+        line = {"frame": frame.index, "status": step.status, **log.entry()}
+        return EncodedFrame(step.state, step.packet, step.status, line)
 
     def resume(self, stream: Path, image: Callable[[int], Frame], last: int | None = None) -> int | None:
         """Go on after the last sound packet of a stream that this method wrote; return that frame's index.

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -50,8 +49,9 @@ def run_frame(method: StreamingMethod[Any], state: Any, frame: Frame, tools: Run
     """
 
     def work(frame: Frame) -> Step[Any]:
-        given = _given(method, frame)
-        with _blaming(method, frame.index, tools):
+        given, where = _given(method, frame), tools.assembly.where
+        where.enter(frame.index)
+        with error_context(SLOT, method, where):
             step = method.begin(given, tools) if state is None else method.step(state, given, tools)
         _check_step(method, None if state is None else state.player, step, frame=frame, tools=tools)
         return step
@@ -78,7 +78,7 @@ def run_follow_up(
     """
 
     def work(frame: Frame) -> Step[Any]:
-        with _blaming(method, frame.index, tools), tools.log.phase("other"):
+        with error_context(SLOT, method, tools.assembly.where), tools.log.phase("other"):
             found = method.follow_up(state, step, _given(method, frame), tools)
         if found is not step:
             _check_follow_up(method, step, found, tools)
@@ -93,7 +93,8 @@ def run_follow_up(
 
 def run_resume(method: StreamingMethod[Any], player: PlayerState, shown: Frame, tools: RunTools) -> Any:
     """Return the state of the method after the last packet of a stream."""
-    with _blaming(method, player.frame, tools):
+    tools.assembly.where.enter(player.frame)
+    with error_context(SLOT, method, tools.assembly.where):
         return method.resume(player, _given(method, shown), tools)
 
 
@@ -114,15 +115,6 @@ def _tried(
 def _given(method: StreamingMethod[Any], frame: Frame) -> Frame:
     """What the method is given: images of float32, as methods expect them, unless it is the engine's own."""
     return frame if isinstance(method, PartsMethod) else frame.as_float32()
-
-
-@contextmanager
-def _blaming(method: StreamingMethod[Any], index: int, tools: RunTools) -> Iterator[None]:
-    where = tools.assembly.where
-    where.enter(index)
-    with error_context(SLOT, method, where):
-        yield
-    where.enter(index)  # no iteration goes on
 
 
 def _check_step(
@@ -168,4 +160,5 @@ def _check_follow_up(method: StreamingMethod[Any], step: Step[Any], found: Step[
 
 
 def _fault(method: StreamingMethod[Any], tools: RunTools, message: str) -> ComponentError:
+    tools.assembly.where.pause()  # the step is made: no iteration of it goes on
     return fault(message, SLOT, method, tools.assembly.where)

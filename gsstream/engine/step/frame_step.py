@@ -89,8 +89,8 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
         kept = replace(state, previous=shown, session=session, resident=resident)
         after = next_state(assembly.motion, kept, player, rng)
     log.set(changed_tiles=1.0 if change is None else change.share, **step_numbers(solution, len(rows), session))
-    if budget.is_limited and (len(rows) or scope is Scope.NONE):
-        log.set(budget=schedule.usage(fitted))
+    if (schedule.timed or schedule.sized) and (len(rows) or scope is Scope.NONE):
+        log.set(budget=schedule.usage(fitted, state.player.layout))
     return Step(after, replace(fitted.packet, decoded=player), "empty" if unchanged else "delta")
 
 

@@ -63,9 +63,8 @@ def propose_motion(
         delta = Delta(motions)
         # What cannot be sent is refused before anything is learned on it.
         sections = encode_motions(delta.motions) + ([] if delta.field is None else encode_field(delta.field))
-        most = budget.max_bytes
         share = 1.0 if assembly.update.scope(frame.index) is Scope.NONE else MAX_SIZE_SHARE
-        if most is not None and sum(len(data) for _, data in sections) > share * most:
+        if budget.max_bytes is not None and sum(len(data) for _, data in sections) > share * budget.max_bytes:
             return Moved((), scene, work)
         scene, touched = apply_motions(scene, delta.motions)
         if delta.field is not None:

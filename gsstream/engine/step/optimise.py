@@ -50,7 +50,9 @@ def optimise(assembly: Assembly, problem: Problem, schedule: EpochScheduler) -> 
         return Solution(problem.rows.cpu(), {}, {}, problem.logits.cpu())
     fit, losses = _Fit(assembly, problem, schedule), list[torch.Tensor]()
     while schedule.goes_on and len(fit.rows):
-        losses = [loss for views in schedule.next_pass(fit.order()) for loss in fit.run(views)]
+        # Reversed, because older versions took views from the end of the list: so equal seeds still give equal bytes.
+        order = torch.randperm(len(problem.cameras), generator=problem.generator).tolist()[::-1]
+        losses = [loss for views in schedule.next_pass(order) for loss in fit.run(views)]
         if not schedule.is_cut:
             fit.end_pass()
     return fit.solution(losses)
@@ -83,11 +85,6 @@ class _Fit:
         )
         self.iterations, self.open_gates = 0, list[int]()
 
-    def order(self) -> list[int]:
-        """Return the views in the order of the next pass."""
-        # Reversed, because older versions took views from the end of the list: so equal seeds still give equal bytes.
-        return torch.randperm(len(self.problem.cameras), generator=self.problem.generator).tolist()[::-1]
-
     def run(self, views: Sequence[int]) -> list[torch.Tensor]:
         """Make one iteration on each of these views; return the photometric losses."""
         cameras, final, first = self.problem.cameras, self.assembly.recipe.stream.lr_final_factor, self.iterations
@@ -109,12 +106,11 @@ class _Fit:
 
     def end_pass(self) -> None:
         """Let go of rows whose gate has closed, but where the recipe lets everything take part; weigh the bytes."""
-        schedule = self.schedule
         self.open_gates.append(int(self.opened().sum()))
-        if schedule.budget.change_threshold > 0 and schedule.goes_on:
-            self.release(schedule.done / schedule.epochs)
-        if len(self.rows):
-            schedule.weigh_bytes(self.estimated_bytes)
+        if self.schedule.budget.change_threshold > 0 and self.schedule.goes_on:
+            self.release(self.schedule.done / self.schedule.epochs)
+        if self.schedule.sized and len(self.rows):
+            self.schedule.weigh_bytes(self.estimated_bytes())
 
     def frozen(self, fraction: float) -> torch.Tensor | None:
         """[A] bool: rows whose level is not trained yet at this share of the frame; None: all take part."""

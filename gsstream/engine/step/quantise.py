@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -18,8 +18,8 @@ from gsstream.engine.step.problem import Problem, Solution
 from gsstream.method.packets import delta_packet
 from gsstream.packet import EncodedPacket, PlayerState, quantise_decoders
 from gsstream.packet.changes.motion import encode_motions
+from gsstream.parts.update.base import AttributeCode, scale_steps
 from gsstream.parts.update.base import quantise_latents as residual_symbols
-from gsstream.parts.update.base import scale_steps
 
 #: Largest symbol of 32 bits that float32 represents: anything between it and 2^31 would be rounded up to 2^31.
 MAX_INT32_SYMBOL = 2.0**31 - 256
@@ -30,12 +30,11 @@ def quantise_residual(assembly: Assembly, problem: Problem, solution: Solution) 
 
     Raises ComponentError when what was learned cannot be sent: not finite, or beyond symbols of 32 bits.
     """
-    check_solution(assembly, problem, solution)
-    layout = problem.layout
+    codes, layout = scale_steps(assembly.update.codes(), problem.step_scale), problem.layout
+    check_solution(assembly, codes, solution)
     final = assembly.gate.sample(solution.logits, None)
     gates = torch.round(final * assembly.gate.num_levels).numpy().astype(np.uint8)
     rows = solution.rows.numpy()
-    codes = scale_steps(assembly.update.codes(), problem.step_scale)
     integers = {name: value.numpy() for name, value in residual_symbols(codes, solution.latents).items()}
     changing = np.zeros(len(rows), bool)
     for value in integers.values():
@@ -59,12 +58,9 @@ def quantise_residual(assembly: Assembly, problem: Problem, solution: Solution) 
     )
 
 
-def check_solution(assembly: Assembly, problem: Problem, solution: Solution) -> None:
+def check_solution(assembly: Assembly, codes: Mapping[str, AttributeCode], solution: Solution) -> None:
     """Raise ComponentError unless what was learned can be sent: finite, and residuals within 32 bit symbols."""
-    codes, look = (
-        scale_steps(assembly.update.codes(), problem.step_scale),
-        Look(assembly.checks, "update", assembly.part("update"), assembly.where),
-    )
+    look = Look(assembly.checks, "update", assembly.part("update"), assembly.where)
     for name, value in solution.latents.items():
         most = codes[name].step * MAX_INT32_SYMBOL
         what = f"{name} after the last iteration ({VARIABLE}=step finds the first)"
@@ -96,7 +92,7 @@ def encode_frame(
     motions = delta.motions
     encoded = partial(delta_packet, before, frame=frame, known=(motions, encode_motions(motions)))
     packet = encoded(delta)
-    whole = TrimmedDelta(delta, packet, len(packet.data))
+    whole = TrimmedDelta(delta, packet, delta, len(packet.data))
     limit = max_bytes or _share(delta, encoded, whole.untrimmed, trim)
     if whole.untrimmed <= limit:
         return whole

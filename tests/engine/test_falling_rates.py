@@ -96,9 +96,9 @@ class Heard:
             patch.setattr(kind, "step", self._stepped(kind.step))
 
     def _opened(self, begin: Callable[..., None]) -> Callable[..., None]:
-        def opened(table: ResidualOptimiser, *arguments: Any) -> None:
+        def opened(table: ResidualOptimiser, *arguments: Any, **named: Any) -> None:
             self.frames.append([])
-            begin(table, *arguments)
+            begin(table, *arguments, **named)
 
         return opened
 

@@ -145,7 +145,7 @@ def metrics(out: Path) -> list[dict[str, Any]]:
 def growing(monkeypatch: pytest.MonkeyPatch, method: str) -> None:
     """Every second frame splits 20 Gaussians off and removes ten."""
 
-    def grown(parts, state, delta, view, rng):
+    def grown(parts, state, delta, work, rng):
         player = state.player
         if player.frame % 2:
             return delta

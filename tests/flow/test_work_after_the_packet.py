@@ -100,10 +100,10 @@ def test_no_latency_contains_its_own_refinement_but_the_last(tmp_path: Path, mon
     clock, held = [0.0], []
     advanced = refine.advance_refinement
 
-    def slow(*args: Any) -> Any:
+    def slow(*args: Any, **named: Any) -> Any:
         clock[0] += 1000.0
         held.append(written(tmp_path / "run" / "stream.gss")[-1])
-        return advanced(*args)
+        return advanced(*args, **named)
 
     monkeypatch.setattr(refine, "advance_refinement", slow)
     shifted = SimpleNamespace(time=lambda: time.time() + clock[0], perf_counter=time.perf_counter)
@@ -136,12 +136,12 @@ def test_frames_that_come_during_the_refinement_wait_as_the_policy_says(
     come(1)
     advanced = refine.advance_refinement
 
-    def busy(*args: Any) -> Any:
-        if args[4].index == 1:
+    def busy(*args: Any, **named: Any) -> Any:
+        if named["frame"].index == 1:
             for frame in range(2, 6):
                 come(frame)
             (live / "END").touch()
-        return advanced(*args)
+        return advanced(*args, **named)
 
     monkeypatch.setattr(refine, "advance_refinement", busy)
     source = f"watch:{live}?behind=drop&queue=1&ready=rename"

@@ -13,7 +13,6 @@ import torch
 from gsstream.core.changes import Delta, Scene, apply_delta, sent_rows
 from gsstream.core.deferred import deferred_checks
 from gsstream.core.frame import Frame
-from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.log import FrameLog
 from gsstream.core.rng import Rng
@@ -147,31 +146,19 @@ MOST_CHANGED = 0.5
 def keep(
     work: EngineContext, scene: Scene, delta: Delta, player: PlayerState
 ) -> tuple[RenderSession | None, Resident | None]:
-    """Return what of a frame stays with the renderer, and on its device; nothing where :func:`commit_session` says so.
+    """Return the session of the decoded scene, with what did not change still projected, and the scene on its device.
 
-    Where the frame changed nothing, the images that the scene shows stay those of the frame before.
+    Nothing where keeping costs more than it saves: rows came or went, or most of them changed. On a processor the scene
+    is the player's own. Where the frame changed nothing, the scene shows the images that it showed before.
     """
-    found = commit_session(work, scene, delta, player)
-    if found is None:
+    # Where a delta is empty though something moved, not even the motions were sent.
+    if delta.has_row_edit or (delta.is_empty and scene.gaussians is not player.gaussians):
         return None, None
-    if work.images.device.type == "cpu":
-        return found[0], None
-    return found[0], Resident(found[1], work.hierarchy, work.previous_images if delta.is_empty else work.images)
-
-
-def commit_session(
-    work: EngineContext, scene: Scene, delta: Delta, player: PlayerState
-) -> tuple[RenderSession, Gaussians[torch.Tensor]] | None:
-    """Return the session of the decoded scene, with what did not change still projected, and the scene itself.
-
-    None where keeping costs more than it saves: rows came or went, or most of them changed.
-    """
-    if delta.has_row_edit:
-        return None
-    if delta.is_empty and scene.gaussians is not player.gaussians:
-        return None  # not even the motions were sent: the decoded scene is the one before them
     rows = sent_rows(scene.layout, delta.gates(scene.layout))
     if len(rows) > MOST_CHANGED * len(player.gaussians):
-        return None
+        return None, None
     gaussians = updated(work.gaussians, player.gaussians, rows)
-    return work.session.commit(gaussians, torch.from_numpy(rows).to(gaussians.means.device)), gaussians
+    session = work.session.commit(gaussians, torch.from_numpy(rows).to(gaussians.means.device))
+    if work.images.device.type == "cpu":
+        return session, None
+    return session, Resident(gaussians, work.hierarchy, work.previous_images if delta.is_empty else work.images)

@@ -32,8 +32,7 @@ def quantise_residual(assembly: Assembly, problem: Problem, solution: Solution) 
     """
     codes, layout = scale_steps(assembly.update.codes(), problem.step_scale), problem.layout
     check_solution(assembly, codes, solution)
-    final = assembly.gate.sample(solution.logits, None)
-    gates = torch.round(final * assembly.gate.num_levels).numpy().astype(np.uint8)
+    gates = torch.round(assembly.gate.sample(solution.logits, None) * assembly.gate.num_levels).numpy().astype(np.uint8)
     rows = solution.rows.numpy()
     integers = {name: value.numpy() for name, value in residual_symbols(codes, solution.latents).items()}
     changing = np.zeros(len(rows), bool)

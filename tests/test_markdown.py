@@ -332,7 +332,7 @@ def test_methods_exist(page: Path) -> None:
     known = {name for kind, name in catalog().entries if kind == "method"}
     calls = [*commands([*shell_lines(page), *INLINE.findall(prose(page))])]
     named = {name for words in calls for name in methods_named(words)}
-    named |= set(re.findall(r"encoder_for\(\"([^\"]+)\"", page.read_text(encoding="utf-8")))
+    named |= set(re.findall(r"\b(?:encoder_for|encode)\(\"([^\"]+)\"", page.read_text(encoding="utf-8")))
     known |= {words[1] for words in calls if words[:1] == ["new-plugin"]}  # a method that the page shows how to write
     check(sorted(n for n in named - known if not (PLACEHOLDER.fullmatch(n) or n.endswith(".yaml"))))
 

@@ -48,7 +48,7 @@ def label_of(path: Path) -> str | None:
 
 def hint(path: Path) -> str:
     """Return what to say when there is no file ``path`` but a recipe of that name is shipped; else nothing."""
-    return f"; gsstream ships a recipe of this name: --recipe {SCHEME}{path.stem}" if path.stem in names() else ""
+    return f"; a recipe of this name comes with gsstream: --recipe {SCHEME}{path.stem}" if path.stem in names() else ""
 
 
 def meant_for(uri: str) -> str | None:

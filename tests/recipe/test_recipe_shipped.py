@@ -68,7 +68,7 @@ def test_a_misspelt_name_is_answered_with_the_nearest_and_the_list(capsys: pytes
 
 def test_a_path_that_is_not_there_is_answered_with_the_name() -> None:
     """After ``pip install`` there is no folder ``configs``."""
-    with pytest.raises(RecipeError, match="gsstream ships a recipe of this name: --recipe recording:n3dv"):
+    with pytest.raises(RecipeError, match="a recipe of this name comes with gsstream: --recipe recording:n3dv"):
         resolve("configs/recordings_elsewhere/n3dv.yaml")
     with pytest.raises(RecipeError) as caught:
         resolve("configs/mine.yaml")

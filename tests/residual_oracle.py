@@ -1,4 +1,4 @@
-"""The residual of one attribute after the other, differentiated by autograd: an oracle for ``residual.joint``.
+"""The residual of one attribute after the other, differentiated by autograd: an oracle for ``optimiser.joint``.
 
 ``train_rows`` calls the joint table the way the engine does, with the oracle's arguments.
 """

@@ -21,6 +21,7 @@ from pydantic import BaseModel
 from gsstream.cli.main import app
 from gsstream.cli.table import whole_table
 from gsstream.core.kinds import CONTRACTS
+from gsstream.core.log import PHASES
 from gsstream.discovery.catalog import load_catalog
 from gsstream.recipe.model import Recipe
 from tools.reference.pages import BUILT, FOLDER
@@ -367,3 +368,98 @@ def test_commands_that_messages_name_parse() -> None:
     }
     assert len(calls) > 12
     check(sorted(f"{call}: {said}" for call in calls if (said := problem(shlex.split(call)[1:], complete=False))))
+
+
+#: Groups of entry points and values in examples: neither is a module.
+NO_MODULES = {"gsstream.bench", "gsstream.player", "info.world", "source.info.world", "state.player"}
+#: Variables of examples that are called like a package.
+VARIABLES = {"source", "step"}
+DOTTED = re.compile(r"(?<![\w./\"'-])[a-z_]\w*(?:\.[A-Za-z_]\w*)+(?![\w(/:=-])")
+COMMENT = re.compile(r"(?:^ *|  )#:? (.*)$", re.MULTILINE)
+
+
+@functools.cache
+def modules() -> dict[str, tuple[set[str], str]]:
+    """Dotted name of every module of library, plugins and tools -> names that it binds; its docstrings and comments."""
+    roots = [(ROOT, "gsstream"), (ROOT, "tools"), *((path, "") for path in sorted(ROOT.glob("plugins/*/src")))]
+    found = {}
+    for base, below in roots:
+        for path in (base / below).rglob("*.py"):
+            name = ".".join(path.relative_to(base).with_suffix("").parts).removesuffix(".__init__")
+            text, bound = path.read_text(encoding="utf-8"), set()
+            said = COMMENT.findall(text)
+            for node in ast.walk(ast.parse(text)):
+                if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                    bound.add(node.name)
+                elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+                    bound.add(node.id)
+                elif isinstance(node, ast.alias):
+                    bound.add(node.asname or node.name)
+                elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+                    said.append(str(node.value.value))
+            found[name] = (bound, "\n".join(said))
+    return found
+
+
+@functools.cache
+def ends_of_names() -> dict[str, set[str]]:
+    """Every dotted end of the name of a module -> names that such modules bind: "run.session", "session"."""
+    ends: dict[str, set[str]] = {}
+    for name, (bound, _) in modules().items():
+        words = name.split(".")
+        for first in range(len(words)):
+            ends.setdefault(".".join(words[first:]), set()).update(bound)
+    # A package binds its modules.
+    for name in modules():
+        ends.setdefault(name.partition(".")[0], set()).update(name.split(".")[1:2])
+    return ends
+
+
+def stale(text: str) -> Iterator[str]:
+    """Dotted names in a text that look like a module of ours, or something in one, and are neither.
+
+    Looked at is a name that begins with a package, one of modules alone (``residual.joint``), and a constant of a
+    module (``init.mapping.LENSES``).
+    """
+    packages = {name.split(".")[-2] for name in modules() if "." in name} - VARIABLES
+    ends = ends_of_names()
+    for name in DOTTED.findall(text):
+        words = name.split(".")
+        constant = len(words) > 2 and words[-2] in ends and words[-1].isupper()
+        if not (words[0] in packages or {*words} <= {*ends} or constant) or name in ends or name in NO_MODULES:
+            continue
+        if words[-1] in ENDINGS or name in recipe_keys():
+            continue
+        # The name of a module, or of something in a module (or in something in it, such as a method).
+        if not any(words[at] in ends.get(".".join(words[:at]), ()) for at in range(1, len(words))):
+            yield name
+
+
+def test_names_of_modules_in_docstrings_and_comments_exist() -> None:
+    check([f"{module}: {name}" for module, (_, text) in modules().items() for name in stale(text)])
+
+
+@pytest.mark.parametrize("name", ["engine.run.threads", "gsstream.x.y", "residual.joint", "init.mapping.LENSES"])
+def test_stale_names_are_found(name: str) -> None:
+    assert list(stale(f"One torch thread, as in a run: see ``{name}``.")) == [name]
+
+
+@pytest.mark.parametrize(
+    "name", ["engine.run.session", "core.changes.apply_residual", "gsstream.encode", "stream.epochs", "metrics.jsonl"]
+)
+def test_names_that_exist_are_no_mistakes(name: str) -> None:
+    assert list(stale(f"As in {name}.")) == []
+
+
+#: A phase that is entered in code or named by a call in a page.
+PHASE = re.compile(r"\bphase\(f?[\"'](\w+)")
+
+
+def test_phases_that_pages_and_code_name_are_those_of_a_frame() -> None:
+    places = ["gsstream/**/*.py", "plugins/*/src/**/*.py", "tools/**/*.py"]
+    files = [*PAGES, *(path for place in places for path in ROOT.glob(place))]
+    named = {where(path): set(PHASE.findall(path.read_text(encoding="utf-8"))) for path in files}
+    check([f"{path}: {sorted(names - {*PHASES})}" for path, names in named.items() if names - {*PHASES}])
+    assert len(set().union(*named.values())) > 5
+    table = (ROOT / "docs" / "cost.md").read_text(encoding="utf-8").split("| phase |")[1].split("\n\n")[0]
+    assert set(re.findall(r"^\| `(\w+)`", table, re.MULTILINE)) <= {*PHASES}

@@ -40,7 +40,7 @@ class PrepareOptions:
     """How a scene is made."""
 
     test: tuple[str, ...] | None = None  # ids of test cameras; None: those of a given calibration
-    model: str = "SIMPLE_RADIAL"  # lens model of structure from motion (a key of ``init.mapping.LENSES``)
+    model: str = "SIMPLE_RADIAL"  # lens model of structure from motion (a key of ``seeds.mapping.LENSES``)
     each: bool = False  # every camera has a lens of its own; else all share one where all pictures have one size
     frames: int | None = None  # at most so many frames; None: all
     #: Pictures are shrunk to this width; None: that of the smallest camera. Pictures of other shapes are shrunk

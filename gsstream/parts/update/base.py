@@ -1,6 +1,6 @@
 """UpdateRule: which attributes change, in which latent space, at which quantisation step.
 
-The interface may change with a minor version. Training applies a residual by ``residual.joint`` (torch, with its
+The interface may change with a minor version. Training applies a residual by ``optimiser.joint`` (torch, with its
 gradient written out), encoder and player by ``core.changes.apply_residual`` (numpy, from the integers that are sent);
 ``check_update_closed_loop`` of the contract kit compares the two.
 """

@@ -103,7 +103,7 @@ def bench_frame(plan: FramePlan, catalog: Catalog, progress: Progress) -> dict[s
     machine = machine_facts()
     parts = {name: assemble(recipe, catalog) for name, recipe in variants(plan.recipe).items()}
     results: list[dict[str, Any]] = []
-    # One torch thread, as in a run: see engine.run.threads.
+    # One torch thread, as in a run: see engine.run.encoder.one_torch_thread.
     with torch_threads(1):
         for static in plan.static:
             for sweep, ball in _balls(plan, parts["active"], static, progress):

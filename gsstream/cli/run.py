@@ -119,9 +119,23 @@ def _reused_lines(
         say(f"no camera is held out, so no quality is measured{some}")
 
 
+def meant_for(uri: str) -> str | None:
+    """Return the name of the recipe that is meant for a recording, by its layout; None where there is none.
+
+    ``uri``: of a recording that can be opened. Raises SourceError for a folder whose layout is not known.
+    """
+    from gsstream.input.recordings.open import LAYOUTS, detect
+    from gsstream.recipe.shipped import OF_LAYOUT
+
+    layout, colon, _ = uri.partition(":")
+    if not (colon and layout in LAYOUTS):
+        layout = detect(Path(uri)) if Path(uri).is_dir() else ""
+    return OF_LAYOUT.get(layout)
+
+
 def _proposed(source: str, given: Sequence[Path]) -> str:
     """The line that names the recipe which is meant for a recording; nothing where it is among those given."""
-    from gsstream.recipe.shipped import SCHEME, meant_for, recipe_file
+    from gsstream.recipe.shipped import SCHEME, recipe_file
 
     name = meant_for(source)
     if name is None or recipe_file(f"{SCHEME}{name}").resolve() in [recipe_file(path).resolve() for path in given]:

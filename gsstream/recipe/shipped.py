@@ -49,16 +49,3 @@ def label_of(path: Path) -> str | None:
 def hint(path: Path) -> str:
     """Return what to say when there is no file ``path`` but a recipe of that name is shipped; else nothing."""
     return f"; a recipe of this name comes with gsstream: --recipe {SCHEME}{path.stem}" if path.stem in names() else ""
-
-
-def meant_for(uri: str) -> str | None:
-    """Return the name of the recipe that is meant for a recording, by its layout; None where there is none.
-
-    ``uri``: of a recording that can be opened. Raises SourceError for a folder whose layout is not known.
-    """
-    from gsstream.input.recordings.open import LAYOUTS, detect
-
-    layout, colon, _ = uri.partition(":")
-    if not (colon and layout in LAYOUTS):
-        layout = detect(Path(uri)) if Path(uri).is_dir() else ""
-    return OF_LAYOUT.get(layout)

@@ -8,9 +8,10 @@ import pytest
 from scenes import LAYOUTS, make_world, write_nerfstudio, write_panoptic
 
 from gsstream.cli.main import run_command
+from gsstream.cli.run import meant_for
 from gsstream.recipe.load import load_recipe
 from gsstream.recipe.model import Recipe
-from gsstream.recipe.shipped import OF_LAYOUT, meant_for
+from gsstream.recipe.shipped import OF_LAYOUT
 
 
 @pytest.mark.parametrize("name", LAYOUTS)

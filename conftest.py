@@ -44,7 +44,7 @@ QUICK = (
     "core", "recipe", "parts/update", "parts/render", "metrics", "cli", "packet", "packet/lies", "player", "method",
     "discovery", "parts/motion",
 )  # fmt: skip
-#: Of other rooms what the work of these days leans on: budgets, assembling, what is chosen by numbers, the renderer.
+#: Single files of other rooms: budgets, assembling, what is chosen by numbers, the renderer.
 QUICK_FILES = (
     "flow/test_closed_loop", "test_architecture", "test_markdown", "test_readme", "contract/test_parts",
     "contract/test_rounding", "cpu_render/tests/test_cpu_contract", "engine/test_budget_pace",

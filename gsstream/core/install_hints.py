@@ -7,67 +7,19 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import json
 import re
 import shlex
 import shutil
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 #: What only the extra ``encoder`` brings: everything that imports one of these encodes, measures or plots.
 ENCODER = ("torch", "kornia", "scipy", "matplotlib")
-#: Extra -> the parts and methods of this project's other distributions that it brings.
-SHIPPED: Mapping[str, tuple[str, ...]] = {
-    "s2gs": (
-        "method/s2gs",
-        "method/s2gs-edge",
-        "method/s2gs-fast",
-        "method/s2gs-paper",
-        "confidence/uniform-random",
-        "confidence/view-gradient",
-        "gate/gumbel-sigmoid",
-        "propagation/hierarchical-max",
-        "regularizer/expected-sparsity",
-        "structure/octree",
-        "update/latent",
-        "command/sweep",
-        "command/report",
-        "command/compare",
-        "command/tune",
-        "command/search",
-        "command/gap",
-        "command/left-behind",
-        "command/bench",
-    ),
-    "player": ("renderer/cpu", "loss/cpu", "optimiser/cpu"),
-    "gpu": ("renderer/gsplat",),
-    "methods": (
-        "method/queen",
-        "method/queen-published",
-        "method/queen-m",
-        "method/queen-s",
-        "streaming_method/queen",
-        "method/hicom",
-        "method/hicom-published",
-        "motion/hicom",
-        "method/comgs-s",
-        "method/comgs-l",
-        "motion/keypoints",
-        "confidence/error-gradient",
-        "method/stream3dgs",
-        "method/stream3dgs-cells",
-        "motion/stream3dgs",
-        "method/recon",
-        "method/recon-published",
-        "motion/recon",
-        "method/quarc",
-        "method/quarc-published",
-        "growth/change-gated-copies",
-        "propagation/ft-pruning",
-        "gate/binary-ste",
-        "confidence/onnx",
-    ),
-}
+#: Extra -> the parts, methods and commands of this project's other distributions that it brings, as "KIND/NAME".
+#: ``python -m tools.shipped`` writes it from what the plugins declare.
+TABLE = Path(__file__).with_name("shipped.json")
 #: Whether a package index has gsstream and its plugins. Until one has, commands name sources, or a folder of wheels.
 ON_INDEX = False
 #: The repository, where this is a checkout of it.
@@ -142,7 +94,8 @@ def install_part(kind: str, name: str) -> str | None:
     Returns None for a name that this project does not ship.
     """
     key = f"{kind}/{name}"
-    extra = next((extra for extra, parts in SHIPPED.items() if key in parts), None)
+    shipped: Mapping[str, Sequence[str]] = json.loads(TABLE.read_text(encoding="utf-8"))
+    extra = next((extra for extra, parts in shipped.items() if key in parts), None)
     return None if extra is None else install_extra(extra)
 
 

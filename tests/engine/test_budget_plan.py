@@ -245,6 +245,14 @@ def test_violations_are_written_down_and_summed_up(monkeypatch: pytest.MonkeyPat
     assert budget_lines([{"frame": 0}]) == []
 
 
+def test_the_first_frame_has_no_limit_whatever_its_index(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stream may begin in the middle of a recording."""
+    controller, clock = Controller(Budget(size=1000, time=2.0), Stream()), Clock(monkeypatch)
+    first = clock.settled(controller, 5, 99_000, 90.0, first=True).numbers["budget"]
+    assert (first["limits"], first["violated"]) == ({}, [])
+    assert clock.settled(controller, 6, 1001, 1.0).numbers["budget"]["violated"] == ["size"]
+
+
 def test_fewer_passes_of_motion_and_growth_are_written_down_and_summed_up() -> None:
     planned = FrameBudget(epochs=1, change_threshold=0.0, rd_lambda=0.0, seconds=1.0, part_scale=0.4)
     used = {

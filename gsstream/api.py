@@ -56,7 +56,7 @@ from gsstream.core.shapes import FloatArray as FloatArray
 from gsstream.core.shapes import IntArray as IntArray
 from gsstream.core.shapes import check_finite as check_finite
 from gsstream.core.shapes import check_shape as check_shape
-from gsstream.input.recordings.base import FrameSource as FrameSource
+from gsstream.input.recordings.base import Source as Source
 from gsstream.input.recordings.base import SourceInfo as SourceInfo
 from gsstream.method.base import MethodState as MethodState
 from gsstream.method.base import Step as Step

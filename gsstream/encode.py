@@ -41,7 +41,7 @@ from gsstream.engine.run.encoder import Callbacks as Callbacks
 from gsstream.engine.run.encoder import EncodedFrame as EncodedFrame
 from gsstream.engine.run.encoder import Encoder as Encoder
 from gsstream.engine.run.recording import open_recording as _open
-from gsstream.input.recordings.base import FrameSource as FrameSource
+from gsstream.input.recordings.base import Source as Source
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.input.recordings.canonical import CanonicalSource, recording_similarity
 from gsstream.method.base import StreamingMethod
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
     from gsstream.discovery.catalog import Catalog
 
 __all__ = [
-    "Assembly", "Callbacks", "Cameras", "EncodedFrame", "Encoder", "Frame", "FrameSource", "Parts", "Recipe",
+    "Assembly", "Callbacks", "Cameras", "EncodedFrame", "Encoder", "Frame", "Parts", "Recipe", "Source",
     "StreamWriter", "encode", "encoder_for", "encoder_for_rig", "open_recording", "recipe_for", "to_rig_coordinates",
 ]  # fmt: skip
 
@@ -104,7 +104,7 @@ def _recipe(method: str, settings: Mapping[str, Any] | None, catalog: Catalog) -
 
 
 @contextmanager
-def open_recording(uri: str, recipe: Recipe | None = None) -> Iterator[FrameSource]:
+def open_recording(uri: str, recipe: Recipe | None = None) -> Iterator[Source]:
     """Open a recording, and close it at the end of the block.
 
     Its cameras and points come in coordinates that its rig defines; ``source.info.world`` leads back to the files'.
@@ -122,7 +122,7 @@ def open_recording(uri: str, recipe: Recipe | None = None) -> Iterator[FrameSour
         source.close()
 
 
-def to_rig_coordinates(source: FrameSource) -> FrameSource:
+def to_rig_coordinates(source: Source) -> Source:
     """Return a recording in the coordinates that its rig defines, so that units and origin of its files do not matter.
 
     :func:`open_recording` has done it already; a source of your own has not.
@@ -135,7 +135,7 @@ def to_rig_coordinates(source: FrameSource) -> FrameSource:
 
 def encode(
     method: str,
-    source: FrameSource,
+    source: Source,
     settings: Mapping[str, Any] | None = None,
     *,
     out: str | os.PathLike[str] | None = None,
@@ -161,7 +161,7 @@ def encode(
     return _encoded(encoder_for(method, source, settings, listeners, **parts), source, out)
 
 
-def _encoded(encoder: Encoder, source: FrameSource, out: str | os.PathLike[str] | None) -> Iterator[EncodedFrame]:
+def _encoded(encoder: Encoder, source: Source, out: str | os.PathLike[str] | None) -> Iterator[EncodedFrame]:
     with nullcontext() if out is None else StreamWriter.open(out) as writer:
         for index in itertools.islice(itertools.count(), encoder.assembly.recipe.frames):
             if index == source.info.num_frames:  # asked each time: a recording that grows may end
@@ -181,7 +181,7 @@ def _encoded(encoder: Encoder, source: FrameSource, out: str | os.PathLike[str] 
 
 def encoder_for(
     method: str,
-    source: FrameSource,
+    source: Source,
     settings: Mapping[str, Any] | None = None,
     listeners: Callbacks | None = None,
     **parts: Unpack[Parts],

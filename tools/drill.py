@@ -31,8 +31,8 @@ from gsstream.engine.run.live import latency_lines
 from gsstream.engine.run.session import METRICS, RECIPE
 from gsstream.evaluation.records import mean, read_lines
 from gsstream.input.recordings.calibration import CALIBRATION_FILE, frame_path, read_calibration
-from gsstream.input.recordings.multiview import POINTS_FILE
 from gsstream.input.recordings.open import DEMO_FOLDER
+from gsstream.input.recordings.pointfiles import POINTS_FILE
 
 WATCH = "behind=drop&ready=rename"
 GSSTREAM = (sys.executable, "-c", "from gsstream.cli.main import main; main()")

@@ -23,7 +23,7 @@ from gsstream.core.errors import ComponentError, GsstreamError, OutputError, Rec
 if TYPE_CHECKING:
     from gsstream.discovery.catalog import Catalog
     from gsstream.engine.run.session import RunResult
-    from gsstream.input.recordings.base import FrameSource, SourceInfo
+    from gsstream.input.recordings.base import Source, SourceInfo
     from gsstream.recipe.model import Recipe
 
 #: Methods that are recommended where none is named, best first.
@@ -152,7 +152,7 @@ def _held_out(camera: str) -> str:
     return shlex.quote(f"data.test_cameras=[{name}]")
 
 
-def _first_look(recording: FrameSource, uri: str, quiet: bool, *, again: bool) -> None:
+def _first_look(recording: Source, uri: str, quiet: bool, *, again: bool) -> None:
     """Warn of poses that cannot be right before an hour is spent on them; not ``again`` when a run is resumed."""
     if again:
         return
@@ -164,9 +164,7 @@ def _first_look(recording: FrameSource, uri: str, quiet: bool, *, again: bool) -
         warnings.warn(f"[{finding.code}] {finding.message}. All checks: gsstream scene validate {uri}", stacklevel=2)
 
 
-def _what_there_is(
-    error: GsstreamError, out: Path, recording: FrameSource, wanted: Mapping[str, bool], quiet: bool
-) -> None:
+def _what_there_is(error: GsstreamError, out: Path, recording: Source, wanted: Mapping[str, bool], quiet: bool) -> None:
     """Summary and pictures of a run that failed, as far as it came; the error learns how to go on."""
     from gsstream.engine.run.metrics_log import last_written
     from gsstream.engine.run.session import METRICS, RunResult
@@ -193,7 +191,7 @@ def _what_there_is(
     )
 
 
-def _pictures(result: RunResult, recording: FrameSource, wanted: Mapping[str, bool], quiet: bool, warned: bool) -> None:
+def _pictures(result: RunResult, recording: Source, wanted: Mapping[str, bool], quiet: bool, warned: bool) -> None:
     """Contact sheet, plots, summary and video; ``warned``: the run has said that nothing fast renders here."""
     from gsstream.evaluation.gallery import SUMMARY, write_gallery
     from gsstream.player.render import SlowRendererWarning

@@ -32,6 +32,11 @@ def packed(images: FloatArray) -> Any:
     return stored
 
 
+def to_bytes(images: FloatArray) -> Any:
+    """Return images [..., 3] in [0, 1] rounded to the nearest of the 256 levels of uint8."""
+    return np.rint(np.clip(images, 0, 1) * np.float32(255)).astype(np.uint8)
+
+
 def unpacked(images: Any) -> FloatArray:
     """Return the float32 images of which :func:`packed` made this array; float32 itself is passed on as it is."""
     if images.dtype == np.uint8:

@@ -20,7 +20,7 @@ from gsstream.core.changes import row_gates
 from gsstream.core.errors import InputError
 from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.base import FrameSource
+from gsstream.input.recordings.base import Source
 from gsstream.metrics import changed_mask, psnr
 from gsstream.packet import PlayerState
 from gsstream.player.playback import Playback
@@ -105,7 +105,7 @@ def contact_sheet(columns: Sequence[Column], heading: str = "") -> Image.Image:
 
 def sheet_of_stream(
     stream: str | os.PathLike[str],
-    source: FrameSource,
+    source: Source,
     frames: Sequence[int],
     out: str | os.PathLike[str],
     *,

@@ -17,7 +17,7 @@ from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.evaluation.records import finite_or_none, mean
 from gsstream.evaluation.seen import seen_masks
 from gsstream.evaluation.summary import format_table
-from gsstream.input.recordings.base import FrameSource
+from gsstream.input.recordings.base import Source
 from gsstream.metrics import (
     SSIM_VARIANT,
     OnnxLpips,
@@ -184,7 +184,7 @@ class StreamFrames:
 
 def evaluate(
     stream: str | os.PathLike[str],
-    source: FrameSource,
+    source: Source,
     *,
     frames: Sequence[int] | None = None,
     split: Literal["train", "test"] = "test",
@@ -205,7 +205,7 @@ def evaluate(
 
 def evaluate_frames(
     shown: Shown,
-    source: FrameSource,
+    source: Source,
     *,
     frames: Sequence[int] | None = None,
     split: Literal["train", "test"] = "test",
@@ -283,7 +283,7 @@ def _with_seen(
     )
 
 
-def _truth(source: FrameSource, frame: int, split: Literal["train", "test"], order: Sequence[int]) -> FloatArray:
+def _truth(source: Source, frame: int, split: Literal["train", "test"], order: Sequence[int]) -> FloatArray:
     return source.frame(frame, split).images[list(order)]
 
 

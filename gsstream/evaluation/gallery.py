@@ -13,7 +13,7 @@ from gsstream.engine.budget.report import budget_lines
 from gsstream.engine.run.live import latency_lines
 from gsstream.evaluation.records import FrameRecord, read_lines, read_records
 from gsstream.evaluation.summary import summarise, summary_table
-from gsstream.input.recordings.base import FrameSource
+from gsstream.input.recordings.base import Source
 from gsstream.packet import StreamMeta
 from gsstream.player.playback import Playback
 
@@ -23,7 +23,7 @@ COLUMNS = 5
 NO_FILES: Mapping[int, Path] = MappingProxyType({})
 
 
-def write_gallery(out: Path, source: FrameSource, *, pictures: bool = True, video: bool = True) -> list[Path]:
+def write_gallery(out: Path, source: Source, *, pictures: bool = True, video: bool = True) -> list[Path]:
     """Write the summary and every picture a person would look for first; return what was written."""
     with Playback(out / STREAM) as playback:
         frames, meta = playback.frames, playback.meta
@@ -40,7 +40,7 @@ def write_gallery(out: Path, source: FrameSource, *, pictures: bool = True, vide
     return written
 
 
-def _still_pictures(out: Path, source: FrameSource, meta: StreamMeta, records: Sequence[FrameRecord]) -> list[Path]:
+def _still_pictures(out: Path, source: Source, meta: StreamMeta, records: Sequence[FrameRecord]) -> list[Path]:
     from gsstream.evaluation.plots import plot_runs
 
     written = [write_sheet(out, source)]
@@ -60,7 +60,7 @@ def _write_summary(out: Path, meta: StreamMeta, records: Sequence[FrameRecord]) 
     return out / SUMMARY
 
 
-def write_sheet(out: Path, source: FrameSource, fresh: Mapping[int, Path] = NO_FILES) -> Path:
+def write_sheet(out: Path, source: Source, fresh: Mapping[int, Path] = NO_FILES) -> Path:
     """Write the contact sheet of a run: a few frames, and those of which ``fresh`` holds another stream."""
     from gsstream.evaluation.contact_sheet import sheet_of_stream
 

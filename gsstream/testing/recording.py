@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from gsstream.core.errors import SourceError
-from gsstream.input.recordings.base import FrameSource
+from gsstream.input.recordings.base import Source
 
 
 class Skip(Exception):
@@ -22,14 +22,14 @@ class SourceUnderTest:
         given: whether somebody asked for this recording. One that was only guessed and cannot be opened skips checks.
     """
 
-    def __init__(self, target: Callable[[str, float], FrameSource], uri: str, *, given: bool = True) -> None:
+    def __init__(self, target: Callable[[str, float], Source], uri: str, *, given: bool = True) -> None:
         self.target, self.uri, self.given = target, uri, given
 
     def __repr__(self) -> str:
         return f"source {getattr(self.target, '__name__', self.target)} on {self.uri!r}"
 
     @contextmanager
-    def open(self, scale: float = 1.0) -> Iterator[FrameSource]:
+    def open(self, scale: float = 1.0) -> Iterator[Source]:
         """Open the recording; it is closed when the check is over."""
         try:
             source = self.target(self.uri, scale)

@@ -11,8 +11,8 @@ import pytest
 
 from gsstream.core.errors import EndOfRecording, InputError, OutputError, UnknownName
 from gsstream.core.frame import Frame
-from gsstream.encode import FrameSource, encode, encoder_for, open_recording
-from gsstream.input.recordings.base import SourceInfo
+from gsstream.encode import encode, encoder_for, open_recording
+from gsstream.input.recordings.base import SourceInfo, Split, Wrapped
 from gsstream.packet import StreamReader, StreamWriter
 
 WORLD = "synthetic:frames=4&views=3&width=32&height=24&supersample=1"
@@ -74,24 +74,20 @@ def test_what_is_wrong_is_said_before_the_loop(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("known", [True, False], ids=["the end is known in time", "the end comes with a frame"])
 def test_it_ends_with_a_recording_that_grows(known: bool) -> None:
-    class Growing:
+    class Growing(Wrapped):
         """A recording that says its length after two frames, or only by having no third."""
 
-        def __init__(self, inner: FrameSource) -> None:
-            self.inner, self.read = inner, 0
+        read = 0
 
         @property
         def info(self) -> SourceInfo:
-            return replace(self.inner.info, num_frames=2 if known and self.read == 2 else None)
+            return replace(super().info, num_frames=2 if known and self.read == 2 else None)
 
-        def frame(self, index: int, split: str = "train") -> Frame:
+        def frame(self, index: int, split: Split = "train") -> Frame:
             if index == 2:
                 raise EndOfRecording("the recording ended after 2 frames")
             self.read += 1
-            return self.inner.frame(index, split)
-
-        def __getattr__(self, name: str) -> Any:
-            return getattr(self.inner, name)
+            return super().frame(index, split)
 
     with open_recording(WORLD) as source:
         assert len(list(encode("dense", Growing(source), TINY))) == 2

@@ -15,10 +15,10 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.run.measure import HeldOut
-from gsstream.input.recordings.base import FrameSource, PointKind, SourceInfo, Split
+from gsstream.input.recordings.base import PointKind, Source, SourceInfo, Split, Wrapped
 
 
-class Moved:
+class Moved(Wrapped):
     """A recording whose calibration and points were written in another world: the same pictures.
 
     Arguments:
@@ -26,8 +26,9 @@ class Moved:
         world: leads from its coordinates to the new ones.
     """
 
-    def __init__(self, source: FrameSource, world: World) -> None:
-        self._source, self._world = source, world
+    def __init__(self, source: Source, world: World) -> None:
+        super().__init__(source)
+        self._world = world
 
     @property
     def info(self) -> SourceInfo:
@@ -45,9 +46,10 @@ class Moved:
         cloud = self._source.points(kind)
         return None if cloud is None else replace(cloud, xyz=self._world.points(cloud.xyz))
 
-    def close(self) -> None:
-        """Close the recording."""
-        self._source.close()
+    def stored_frame(self, index: int, split: Split = "train") -> Frame:
+        """Read one instant as it is stored."""
+        frame = self._source.stored_frame(index, split)
+        return replace(frame, cameras=self._world.cameras(frame.cameras))
 
 
 def world(scale: float = 1.0, offset: Sequence[float] = (0.0, 0.0, 0.0), turn: int | None = None) -> World:
@@ -63,7 +65,7 @@ def world(scale: float = 1.0, offset: Sequence[float] = (0.0, 0.0, 0.0), turn: i
     return World(tuple(map(float, rotation)), tuple(float(value) for value in offset), scale)
 
 
-def encode(parts: Assembly, source: FrameSource) -> tuple[dict[str, float], str]:
+def encode(parts: Assembly, source: Source) -> tuple[dict[str, float], str]:
     """Encode a recording: means of its quality and bytes, and a hash of all that its packets change."""
     held_out = HeldOut(parts.renderer)
     encoder = Encoder(parts, source.info, lambda frame: gather_points(source, frame, parts.recipe.first_frame))

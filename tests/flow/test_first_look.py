@@ -18,7 +18,7 @@ from gsstream.discovery.catalog import load_catalog
 from gsstream.encode import open_recording
 from gsstream.engine.run.measure import HeldOut
 from gsstream.input.prepare.pose_checks import check_poses, check_swapped, first_look
-from gsstream.input.recordings.base import FrameSource
+from gsstream.input.recordings.base import Source
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 #: Poses as others write them, and what undoes it.
@@ -41,7 +41,7 @@ def test_a_black_camera_is_named_before_a_run(frame: Frame) -> None:
         images = frame.images.copy()
         images[2] = 0
         black = SimpleNamespace(info=source.info, frame=lambda index, split: replace(frame, images=images))
-        (finding,) = first_look(cast("FrameSource", black))
+        (finding,) = first_look(cast("Source", black))
         assert finding.code == "blank"
         assert f"camera {source.info.train.ids[2]!r} is black" in finding.message
 
@@ -59,7 +59,7 @@ def test_swapped_cameras_are_named_and_one_wrong_pose_is_no_swap(frame: Frame, p
             for split, f, at in (("train", frame, slice(8)), ("test", source.frame(0, "test"), slice(8, 9)))
         }
         mixed = SimpleNamespace(info=source.info, frame=lambda index, split: shown[split])
-        (finding,) = first_look(cast("FrameSource", mixed))
+        (finding,) = first_look(cast("Source", mixed))
     first, second = (whole.cameras.ids[c] for c in sorted(pair))
     assert f"cameras {first!r} and {second!r} are swapped" in finding.message
     poses = whole.cameras.viewmats.copy()

@@ -28,7 +28,7 @@ from gsstream.api import (
 )
 from gsstream.encode import Encoder, encoder_for, open_recording
 from gsstream.engine.run.session import run
-from gsstream.input.recordings.base import FrameSource
+from gsstream.input.recordings.base import Source
 from gsstream.packet import StreamReader, decode_packet
 
 WORLD = "synthetic:frames=7&views=3&width=32&height=24&supersample=1"
@@ -127,7 +127,7 @@ ROWS = {
 
 
 @contextmanager
-def encoder(row: Row) -> Iterator[tuple[Encoder, FrameSource]]:
+def encoder(row: Row) -> Iterator[tuple[Encoder, Source]]:
     with open_recording(WORLD) as source:
         yield encoder_for("dense", source, {**TINY, **row.settings}, streaming_method=Stranger()), source
 

@@ -69,7 +69,7 @@ def hooks() -> str:
     from gsstream.core.kinds import CONTRACTS, PART_KINDS
     from gsstream.core.part import Traits
     from gsstream.discovery import hookspecs
-    from gsstream.input.recordings.base import FrameSource
+    from gsstream.input.recordings.base import Source
     from gsstream.spec import KINDS, ComponentSpec, MethodSpec
 
     lines = [NOTE, "# Hooks, specs and contracts of parts", "", "## Hooks", ""]
@@ -82,7 +82,7 @@ def hooks() -> str:
         lines += [f"| `{k}` | {cell(t)} | `{d}` | {cell(m)} |" for k, t, d, m in setting_rows(model)]
         lines.append("")
     lines += ["## Kinds", "", f"{', '.join(f'`{kind}`' for kind in KINDS)}.", ""]
-    contracts = {kind: _named(target) for kind, target in CONTRACTS.items()} | {"source": FrameSource}
+    contracts = {kind: _named(target) for kind, target in CONTRACTS.items()} | {"source": Source}
     for kind, contract in contracts.items():
         lines += [f"### {kind}: `{contract.__module__}.{contract.__name__}`", "", inspect.getdoc(contract) or "", ""]
         for name, member in vars(contract).items():
@@ -90,7 +90,6 @@ def hooks() -> str:
                 function = member.fget if isinstance(member, property) else member
                 must = "abstract" if getattr(member, "__isabstractmethod__", False) else "has a default"
                 must = "final" if getattr(member, "__final__", False) else must
-                must = "expected" if contract is FrameSource else must
                 how = "property " if isinstance(member, property) else ""
                 about = (inspect.getdoc(function) or "").splitlines()
                 lines.append(f"- {how}`{signature(name, function)}` ({must}){': ' + about[0] if about else ''}")

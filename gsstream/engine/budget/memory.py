@@ -11,12 +11,11 @@ from typing import Any
 from gsstream.core.errors import InputError
 from gsstream.core.picture_size import COMPACT_PIXELS
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.input.recordings.base import SourceInfo
-from gsstream.recipe.model import Recipe
+from gsstream.input.recordings.base import Source
 
 #: Interpreter, torch, the renderer and the engine with everything a run imports (measured).
 PROCESS = 310_000_000
-#: Of a training image: the frame, the one before and two read ahead, which wait as bytes or float32.
+#: Of a training image: the frame, the one before and two read ahead, which wait as the source hands them over.
 WAITING = 4
 #: What is made of images of one camera at a time, in images of float32: renders, gradients, maps of the loss, and the
 #: temporary ones of every phase (measured at widths of 320 and 1352).
@@ -29,12 +28,12 @@ FOR_GAUSSIANS = 0.6
 MIN_GAUSSIANS = 1_000
 
 
-def min_memory(info: SourceInfo, recipe: Recipe) -> int:
+def min_memory(source: Source) -> int:
     """Return how many bytes a run of this recording needs with the least number of Gaussians."""
-    return _fixed(info, recipe) + round(MIN_GAUSSIANS * BYTES_PER_GAUSSIAN / FOR_GAUSSIANS)
+    return _fixed(source) + round(MIN_GAUSSIANS * BYTES_PER_GAUSSIAN / FOR_GAUSSIANS)
 
 
-def limit_memory(assembly: Assembly, info: SourceInfo) -> Assembly:
+def limit_memory(assembly: Assembly, source: Source) -> Assembly:
     """Return the parts with so few Gaussians and so small a cache of the renderer that the memory budget holds.
 
     Raises InputError when the budget is below what any run of this recording needs.
@@ -42,15 +41,15 @@ def limit_memory(assembly: Assembly, info: SourceInfo) -> Assembly:
     memory = assembly.recipe.budget.memory
     if memory is None:
         return assembly
-    least = min_memory(info, assembly.recipe)
+    least, train = min_memory(source), source.info.train
     if memory < least:
         raise InputError(
             f"budget.memory: {memory / 1e6:.0f} MB, but a run of this recording needs at least "
             f"{least / 1e6:.0f} MB ({PROCESS / 1e6:.0f} MB for the process, the rest for "
-            f"{len(info.train)} training cameras of {info.train.width} x {info.train.height} pixels and "
+            f"{len(train)} training cameras of {train.width} x {train.height} pixels and "
             f"{MIN_GAUSSIANS} Gaussians); give more, or lower --scale"
         )
-    free, first = memory - _fixed(info, assembly.recipe), assembly.recipe.first_frame
+    free, first = memory - _fixed(source), assembly.recipe.first_frame
     most = min(first.max_gaussians, round(FOR_GAUSSIANS * free) // BYTES_PER_GAUSSIAN)
     recipe = assembly.recipe.model_copy(update={"first_frame": first.model_copy(update={"max_gaussians": most})})
     assembly = replace(assembly, recipe=recipe)
@@ -71,9 +70,18 @@ def _with_cache(assembly: Assembly, megabytes: float) -> Assembly:
     return replace(assembly, recipe=recipe, renderer=renderer)
 
 
-def _fixed(info: SourceInfo, recipe: Recipe) -> int:
-    # Images that are read at their own size are taken for 8-bit ones, as nearly all are.
-    waiting = WAITING / 4 if recipe.scale == 1 else WAITING + 1  # one frame is read before it is stored
-    statistics = 1 if info.train.width * info.train.height >= COMPACT_PIXELS else 2
-    images = (waiting + statistics) * len(info.train) + 4 * len(info.test) + WORKING
-    return PROCESS + round(images * 12 * info.train.width * info.train.height)
+def waiting_memory(source: Source) -> int:
+    """Return how many bytes the training images take that wait at one time, as the source hands them over."""
+    return WAITING * len(source.info.train) * _pixels(source) * (3 if source.stores_bytes else 12)
+
+
+def _fixed(source: Source) -> int:
+    train, test = source.info.train, source.info.test
+    # Statistics of frame 0, and a frame of float32 that is being read beside those that wait.
+    more = (1 if _pixels(source) >= COMPACT_PIXELS else 2) + (0 if source.stores_bytes else 1)
+    return PROCESS + waiting_memory(source) + (more * len(train) + 4 * len(test) + WORKING) * 12 * _pixels(source)
+
+
+def _pixels(source: Source) -> int:
+    """Pixels of one image."""
+    return source.info.train.width * source.info.train.height

@@ -6,7 +6,7 @@ from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud, join_frames, shrink_frame
 from gsstream.core.progress import Tell, silent
 from gsstream.engine.fit import constants
-from gsstream.input.recordings.base import FrameSource
+from gsstream.input.recordings.base import Source
 from gsstream.input.recordings.depth_maps import read_depth_maps
 from gsstream.input.seeds.seeding import photo_consistent_seeds
 from gsstream.input.seeds.shell import shell_points
@@ -18,7 +18,7 @@ SPARSE = 2000
 SWEEP_WIDTH = 160
 
 
-def gather_points(source: FrameSource | None, frame: Frame, settings: FirstFrame, tell: Tell = silent) -> PointCloud:
+def gather_points(source: Source | None, frame: Frame, settings: FirstFrame, tell: Tell = silent) -> PointCloud:
     """Return the points to seed from. Only the cameras of ``frame`` take part, and points that the source vouches for.
 
     Where a plane sweep is made, it uses the recording's depth maps.
@@ -30,7 +30,7 @@ def gather_points(source: FrameSource | None, frame: Frame, settings: FirstFrame
     return thin_points(_base_points(source, frame, settings, tell), limit)
 
 
-def with_test_views(source: FrameSource, frame: Frame) -> Frame:
+def with_test_views(source: Source, frame: Frame) -> Frame:
     """Return the frame with the images of the test cameras behind its own.
 
     This is what ``data.leak = points`` lets seeding see.
@@ -38,7 +38,7 @@ def with_test_views(source: FrameSource, frame: Frame) -> Frame:
     return join_frames(frame, source.frame(frame.index, "test"))
 
 
-def _base_points(source: FrameSource | None, frame: Frame, settings: FirstFrame, tell: Tell) -> PointCloud:
+def _base_points(source: Source | None, frame: Frame, settings: FirstFrame, tell: Tell) -> PointCloud:
     wanted = settings.points
     if wanted == "sfm":
         return _triangulate(frame, tell)
@@ -68,7 +68,7 @@ def _triangulate(frame: Frame, tell: Tell) -> PointCloud:
     return triangulate_points(frame.images, frame.cameras, tell=tell)
 
 
-def _sweep(frame: Frame, settings: FirstFrame, tell: Tell, source: FrameSource | None) -> PointCloud:
+def _sweep(frame: Frame, settings: FirstFrame, tell: Tell, source: Source | None) -> PointCloud:
     """Points that several training views agree on, found at most SWEEP_WIDTH pixels wide (time grows with pixels)."""
     small = shrink_frame(frame, -(-frame.cameras.width // SWEEP_WIDTH))
     known = None

@@ -11,13 +11,13 @@ from gsstream.engine.run.displacement import displacement_pixels
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.step.metrics import log_packet
-from gsstream.input.recordings.base import FrameSource
+from gsstream.input.recordings.base import Source
 from gsstream.packet import EncodedPacket, PlayerState, StreamReader, decode_packet
 from gsstream.packet.base import PACKET_HEADER, SECTION_HEADER, parse_packet
 
 
 def measure_again(
-    stream: Path, missing: Sequence[int], source: FrameSource, encoder: Encoder, held_out: HeldOut | None
+    stream: Path, missing: Sequence[int], source: Source, encoder: Encoder, held_out: HeldOut | None
 ) -> Iterator[dict[str, Any]]:
     """Yield a line for each of these frames of a stream, which ascend.
 

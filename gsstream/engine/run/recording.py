@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from gsstream.core.errors import GsstreamError, PacketError, PluginUnavailable, RecipeError
 from gsstream.discovery.catalog import Catalog
-from gsstream.input.recordings.base import FrameSource
+from gsstream.input.recordings.base import Source
 from gsstream.input.recordings.canonical import CanonicalSource, recording_similarity
 from gsstream.input.recordings.open import open_source
 from gsstream.input.recordings.options import DataOptions
@@ -20,7 +20,7 @@ from gsstream.packet import PlayerState, StreamReader, decode_packet
 from gsstream.recipe.model import Recipe
 
 
-def open_recording(uri: str, recipe: Recipe, catalog: Catalog) -> FrameSource:
+def open_recording(uri: str, recipe: Recipe, catalog: Catalog) -> Source:
     """Open ``uri`` at the scale, with the split and through the transforms that a recipe asks for.
 
     Cameras and points come in coordinates that the cameras define; ``info.world`` leads back to those of the files.
@@ -37,7 +37,7 @@ def open_recording(uri: str, recipe: Recipe, catalog: Catalog) -> FrameSource:
     return _open(uri, recipe.scale, recipe.data, catalog)
 
 
-def reopen_recording(uri: str, recipe: Mapping[str, Any], catalog: Catalog) -> FrameSource:
+def reopen_recording(uri: str, recipe: Mapping[str, Any], catalog: Catalog) -> Source:
     """Open ``uri`` as the run did whose recipe a stream carries. Raises RecipeError for unknown data options."""
     try:
         data = DataOptions.model_validate_json(json.dumps(recipe.get("data", {})))
@@ -50,7 +50,7 @@ def reopen_recording(uri: str, recipe: Mapping[str, Any], catalog: Catalog) -> F
     return _open(uri, float(recipe.get("scale", 1.0)), data, catalog)
 
 
-def _open(uri: str, scale: float, data: DataOptions, catalog: Catalog) -> FrameSource:
+def _open(uri: str, scale: float, data: DataOptions, catalog: Catalog) -> Source:
     source = _open_plain(uri, scale, catalog)
     try:
         return CanonicalSource(transformed(source, data), recording_similarity(source))
@@ -59,7 +59,7 @@ def _open(uri: str, scale: float, data: DataOptions, catalog: Catalog) -> FrameS
         raise
 
 
-def _open_plain(uri: str, scale: float, catalog: Catalog) -> FrameSource:
+def _open_plain(uri: str, scale: float, catalog: Catalog) -> Source:
     """A source part of a plugin when the scheme names one, else one of the built-in sources."""
     scheme = uri.partition(":")[0]
     entry = catalog.entries.get(("source", scheme))
@@ -67,7 +67,9 @@ def _open_plain(uri: str, scale: float, catalog: Catalog) -> FrameSource:
         return open_source(uri, scale)
     factory = catalog.resolve("source", scheme)
     try:
-        source: FrameSource = factory(uri, scale)
+        source: Source = factory(uri, scale)
+        if not isinstance(source, Source):
+            raise TypeError(f"expected a gsstream.api.Source, got {type(source).__name__}")
     except GsstreamError:
         raise
     except Exception as error:  # third-party code: reported with its owner's name

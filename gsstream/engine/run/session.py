@@ -25,7 +25,7 @@ from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.run.measured_again import measure_again
 from gsstream.engine.run.metrics_log import add_metrics, append_metrics, last_written, trim_metrics
 from gsstream.engine.run.progress import RunProgress
-from gsstream.input.recordings.base import AdaptiveSource, FrameSource, LiveSource, SourceInfo
+from gsstream.input.recordings.base import Source, SourceInfo
 from gsstream.input.recordings.prefetch import Prefetcher
 from gsstream.packet import EncodedPacket, PlayerState, StreamReader, StreamWriter
 from gsstream.packet.base import FILE_HEADER
@@ -56,7 +56,7 @@ class RunResult:
 
 def run(
     assembly: Assembly,
-    source: FrameSource,
+    source: Source,
     out: Path,
     *,
     resume: bool = False,
@@ -78,7 +78,7 @@ def run(
         listener: called before and after every frame.
     """
     state = _Run(
-        assembly=limit_memory(assembly, source.info),
+        assembly=limit_memory(assembly, source),
         source=source,
         out=out,
         quiet=quiet,
@@ -110,7 +110,7 @@ class _Run:
     def __init__(
         self,
         assembly: Assembly,
-        source: FrameSource,
+        source: Source,
         out: Path,
         quiet: bool,
         measure: bool,
@@ -235,8 +235,8 @@ def _num_frames(info: SourceInfo, wanted: int | None) -> int | None:
     return min((number for number in (info.num_frames, wanted) if number is not None), default=None)
 
 
-def _timed(frames: Prefetcher, source: FrameSource) -> Iterator[tuple[Frame, Frame, float]]:
-    """(train, test, seconds waited) of every frame; an adaptive source is asked again for the epoch scale."""
+def _timed(frames: Prefetcher, source: Source) -> Iterator[tuple[Frame, Frame, float]]:
+    """(train, test, seconds waited) of every frame; the source is asked again for the epoch scale of live ones."""
     while True:
         started = time.perf_counter()
         try:
@@ -244,14 +244,14 @@ def _timed(frames: Prefetcher, source: FrameSource) -> Iterator[tuple[Frame, Fra
         except StopIteration:
             return
         waited = time.perf_counter() - started
-        if train.arrival is not None and isinstance(source, AdaptiveSource):
+        if train.arrival is not None:
             train = replace(train, epoch_scale=min(train.epoch_scale, source.epoch_scale(train.index)))
         yield train, test, waited
 
 
 @contextmanager
 def _stop_on_interrupt(
-    say: Callable[[str], None], source: FrameSource, begun: Callable[[], bool]
+    say: Callable[[str], None], source: Source, begun: Callable[[], bool]
 ) -> Iterator[threading.Event]:
     """First Ctrl-C: finish the frame in flight. Second: stop at once (the stream stays valid up to the last packet).
 
@@ -263,8 +263,7 @@ def _stop_on_interrupt(
         return
 
     def handler(*_: object) -> None:
-        if isinstance(source, LiveSource):
-            source.interrupt()  # the frame in flight may be one that is not captured yet
+        source.interrupt()  # the frame in flight may be one that is not captured yet
         if stop.is_set() or not begun():
             raise KeyboardInterrupt
         stop.set()

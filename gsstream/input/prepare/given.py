@@ -8,7 +8,6 @@ from pathlib import Path
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
 from gsstream.input.prepare.raw import RawCamera, find_cameras
-from gsstream.input.recordings.calibration import CALIBRATION_FILE
 from gsstream.input.recordings.clips import Clip, ImageClip
 from gsstream.input.recordings.distortion import Lens as Distortion
 from gsstream.input.recordings.layouts import declared
@@ -38,11 +37,10 @@ def read_raw(source: str) -> tuple[str, list[RawCamera], GivenRig | None]:
     Raises SourceError for anything else.
     """
     scheme, colon, rest = source.partition(":")
-    named = scheme if colon and scheme in (*LAYOUTS, "folder") else None
+    named = scheme if colon and scheme in LAYOUTS else None
     folder = Path(rest if named else source)
     if folder.is_dir() and named is None:
-        known = (folder / CALIBRATION_FILE).exists() or layouts_of(folder)
-        named = detect(folder) if known else None
+        named = detect(folder) if layouts_of(folder) else None
     if named is None:
         return folder.resolve().name, find_cameras(folder), None
     recording = declared.read(folder, any_sizes=True) if named == "folder" else read_layout(named, folder)

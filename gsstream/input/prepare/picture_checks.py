@@ -9,7 +9,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.input.prepare.findings import Finding, error, warning
-from gsstream.input.recordings.base import FrameSource
+from gsstream.input.recordings.base import Source
 
 FLAT = 2.5 / 255
 JUMP = 0.08
@@ -24,7 +24,7 @@ class Thumbnails:
     train: int
 
 
-def read_thumbnails(source: FrameSource, cameras: Cameras, frames: int) -> Thumbnails:
+def read_thumbnails(source: Source, cameras: Cameras, frames: int) -> Thumbnails:
     """Read the first ``frames`` frames of all ``cameras``.
 
     Raises SourceError for the first image that cannot be read.

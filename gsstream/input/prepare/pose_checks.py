@@ -19,7 +19,7 @@ from gsstream.input.prepare.findings import Finding, error
 from gsstream.input.prepare.match_checks import REPAIRS
 from gsstream.input.prepare.picture_checks import Thumbnails, check_blank
 from gsstream.input.prepare.rig_checks import check_axes, check_intrinsics, check_overlap, check_placement
-from gsstream.input.recordings.base import FrameSource
+from gsstream.input.recordings.base import Source
 from gsstream.input.recordings.canonical import to_file_coordinates
 from gsstream.input.seeds.sweep import SweepSettings, agreements
 
@@ -35,7 +35,7 @@ LEAST = 0.15
 STAND_OUT, SUSPECTS, EXCHANGED = 0.8, 6, 1.7
 
 
-def first_look(source: FrameSource) -> list[Finding]:
+def first_look(source: Source) -> list[Finding]:
     """Return what is wrong with the poses, as far as the rig and the first frame say it in a fraction of a second.
 
     Test cameras take part in the check of swapped poses alone. Raises SourceError when frame 0 cannot be read.

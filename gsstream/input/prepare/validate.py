@@ -20,7 +20,7 @@ from gsstream.input.prepare.picture_checks import Thumbnails, check_blank, check
 from gsstream.input.prepare.pose_checks import check_poses, check_swapped
 from gsstream.input.prepare.rig_checks import check_axes, check_intrinsics, check_overlap, check_placement
 from gsstream.input.prepare.sync_checks import check_sync
-from gsstream.input.recordings.base import FilesMissing, FrameSource
+from gsstream.input.recordings.base import FilesMissing, Source
 from gsstream.input.recordings.canonical import to_file_coordinates
 from gsstream.input.seeds.matching import match_images
 
@@ -28,7 +28,7 @@ from gsstream.input.seeds.matching import match_images
 SMALL, LARGE = 160, 640
 FRAMES = 60
 
-Open = Callable[[float], FrameSource]
+Open = Callable[[float], Source]
 
 
 def validate(open_scene: Open, *, frames: int = FRAMES, features: bool = True) -> list[Finding]:
@@ -55,13 +55,13 @@ def _merged(found: list[Finding]) -> list[Finding]:
     return [replace(found[0], message=f"{found[0].message} ({len(found) - 1} more like this)")]
 
 
-def rig_of(source: FrameSource) -> Cameras:
+def rig_of(source: Source) -> Cameras:
     """Return training cameras, then test cameras."""
     train, test = source.info.train, source.info.test
     return train.joined(test)
 
 
-def _stages(source: FrameSource, open_scene: Open, frames: int, features: bool) -> Iterator[list[Finding]]:
+def _stages(source: Source, open_scene: Open, frames: int, features: bool) -> Iterator[list[Finding]]:
     source = to_file_coordinates(source)
     rig, train = rig_of(source), source.info.train
     yield check_intrinsics(rig)
@@ -95,7 +95,7 @@ def _stages(source: FrameSource, open_scene: Open, frames: int, features: bool) 
         yield _matched(first)
 
 
-def _thumbnails(source: FrameSource, open_scene: Open, rig: Cameras, frames: int) -> Thumbnails:
+def _thumbnails(source: Source, open_scene: Open, rig: Cameras, frames: int) -> Thumbnails:
     small = open_scene(min(1.0, SMALL / rig.width))
     try:
         known = source.info.num_frames

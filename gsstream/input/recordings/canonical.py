@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,13 +11,13 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.world import World, rig_similarity, snap_cameras
-from gsstream.input.recordings.base import AdaptiveSource, FrameSource, LiveSource, PointKind, SourceInfo, Split
+from gsstream.input.recordings.base import PointKind, Source, SourceInfo, Split, Wrapped
 
 #: Points farther from the rig than this many of its extents leave the range in which positions can be coded.
 FARTHEST = 1e12
 
 
-def recording_similarity(source: FrameSource) -> World:
+def recording_similarity(source: Source) -> World:
     """Return the world that a recording's cameras define, training and test cameras together.
 
     So it does not depend on the split.
@@ -26,7 +27,7 @@ def recording_similarity(source: FrameSource) -> World:
     return rig_similarity(rig, source.points)
 
 
-def to_file_coordinates(source: FrameSource) -> FrameSource:
+def to_file_coordinates(source: Source) -> Source:
     """Return a recording in the coordinates of its files, for checks of what the files say.
 
     Poses that were written the wrong way round are mended by inverting them in those coordinates, and in no others.
@@ -34,15 +35,15 @@ def to_file_coordinates(source: FrameSource) -> FrameSource:
     return source.filed if isinstance(source, CanonicalSource) else source
 
 
-class CanonicalSource:
-    """A frame source over another one: the same images, with cameras and points in the coordinates of a world.
+class CanonicalSource(Wrapped):
+    """A source over another one: the same images, with cameras and points in the coordinates of a world.
 
     ``info.world`` leads back. Thread-safe when the inner source is.
     """
 
-    def __init__(self, source: FrameSource, world: World) -> None:
-        self._source, self._world = source, world
-        info = source.info
+    def __init__(self, source: Source, world: World) -> None:
+        super().__init__(source)
+        self._world, info = world, source.info
         self._info = replace(info, train=self._placed(info.train), test=self._placed(info.test), world=world)
 
     @property
@@ -51,7 +52,7 @@ class CanonicalSource:
         return self._info
 
     @property
-    def filed(self) -> FrameSource:
+    def filed(self) -> Source:
         """The inner recording, in the coordinates of its files."""
         return self._source
 
@@ -60,9 +61,20 @@ class CanonicalSource:
         frame = self._source.frame(index, split)
         return replace(frame, cameras=self._placed(frame.cameras))
 
+    def stored_frame(self, index: int, split: Split = "train") -> Frame:
+        """Read one instant as it is stored."""
+        frame = self._source.stored_frame(index, split)
+        return replace(frame, cameras=self._placed(frame.cameras))
+
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
         """Return the inner source's points in this world, float32. Raises SourceError for one that is absurdly far."""
-        cloud = self._source.points(kind)
+        return self._placed_points(self._source.points(kind))
+
+    def points_without(self, cameras: Sequence[str], kind: PointKind = "recording") -> PointCloud | None:
+        """Return those of ``points`` in which none of these cameras took part; None when none are left."""
+        return self._placed_points(self._source.points_without(cameras, kind))
+
+    def _placed_points(self, cloud: PointCloud | None) -> PointCloud | None:
         if cloud is None:
             return None
         xyz = self._world.inverse_points(cloud.xyz)
@@ -72,19 +84,6 @@ class CanonicalSource:
                 f"size of the rig, got one at {float(np.abs(xyz).max()):g}; take it out of the file"
             )
         return replace(cloud, xyz=xyz.astype(np.float32))
-
-    def interrupt(self) -> None:
-        """End the waits of an inner source that grows; others never wait."""
-        if isinstance(self._source, LiveSource):
-            self._source.interrupt()
-
-    def epoch_scale(self, index: int) -> float:
-        """Return what a frame of an inner source that grows is worth now; 1 of any other."""
-        return self._source.epoch_scale(index) if isinstance(self._source, AdaptiveSource) else 1.0
-
-    def close(self) -> None:
-        """Close the inner source."""
-        self._source.close()
 
     def _placed(self, rig: Cameras) -> Cameras:
         return snap_cameras(self._world.inverse_cameras(rig))

@@ -6,14 +6,13 @@ import re
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from PIL import Image, UnidentifiedImageError
 
 from gsstream.core.errors import SourceError
-from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.base import FilesMissing
-from gsstream.input.recordings.images import PICTURE_FORMATS, read_image, told_apart
+from gsstream.input.recordings.images import PICTURE_FORMATS, is_deep, read_stored, told_apart
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
@@ -37,8 +36,15 @@ class Clip(Protocol):
     def first(self) -> int:
         """Number of the first picture, where files are numbered; else 0."""
 
-    def read(self, index: int, target: tuple[int, int]) -> FloatArray:
-        """Read [h, w, 3] float32 in [0, 1], area-averaged to ``target`` (width, height); ``index`` counts from 0."""
+    @property
+    def deep(self) -> bool:
+        """Whether pictures have more than 8 bits per channel."""
+
+    def read(self, index: int, target: tuple[int, int]) -> Any:
+        """Read [h, w, 3], area-averaged to ``target`` (width, height); ``index`` counts from 0.
+
+        uint8, of which 255 is 1.0, of 8 bits at their size; else float32 in [0, 1].
+        """
 
     def close(self) -> None:
         """Do nothing: no file stays open between reads."""
@@ -56,7 +62,7 @@ class ImageClip:
             raise FilesMissing(
                 f"{missing[0]}: the picture is missing ({len(missing)} of {len(files)} of this camera are); restore it"
             )
-        self._size = _size_of(self._files[0])
+        self._size, self._deep = _opened(self._files[0])
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -79,17 +85,22 @@ class ImageClip:
     def first(self) -> int:
         return self._first
 
-    def read(self, index: int, target: tuple[int, int]) -> FloatArray:
-        return read_image(self._files[index], self._size, target, "the first image of its camera has")
+    @property
+    def deep(self) -> bool:
+        return self._deep
+
+    def read(self, index: int, target: tuple[int, int]) -> Any:
+        return read_stored(self._files[index], self._size, target, "the first image of its camera has")
 
     def close(self) -> None:
         """Do nothing: no file stays open between reads."""
 
 
-def _size_of(path: Path) -> tuple[int, int]:
+def _opened(path: Path) -> tuple[tuple[int, int], bool]:
+    """(width, height) of a picture, and whether it is deep."""
     try:
         with Image.open(path, formats=PICTURE_FORMATS) as image:
-            return image.size
+            return image.size, is_deep(path)
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         raise SourceError(
             f"{path}: the image cannot be opened ({error}); expected PNG or JPEG; {told_apart(path)}"

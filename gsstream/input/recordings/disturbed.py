@@ -15,10 +15,23 @@ import re
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from gsstream.core.errors import SourceError, suggest
-from gsstream.input.recordings.base import FrameSource, SourceInfo
-from gsstream.input.recordings.options import DataOptions, Disturbances, validated
-from gsstream.input.recordings.transformed import TransformedSource
+from gsstream.core.frame import Arrival, Frame
+from gsstream.core.rng import Rng
+from gsstream.core.shapes import FloatArray
+from gsstream.core.storage import packed
+from gsstream.input.recordings.base import Moment, Source, SourceInfo, Split, Wrapped, assembled, check_index
+from gsstream.input.recordings.options import Disturbances, validated
+from gsstream.input.recordings.transforms import (
+    gain_at,
+    is_lost,
+    parse_losses,
+    parse_offsets,
+    with_gain,
+    with_noise,
+)
 
 _KEYS = ("seed", *Disturbances.model_fields)
 _PER_CAMERA = ("lost_cameras", "time_offset")
@@ -44,14 +57,94 @@ def parse_disturbances(text: str) -> tuple[Disturbances, int]:
     return validated(Disturbances, values, "disturbed source"), int(seed)
 
 
-class DisturbedSource(TransformedSource):
-    """A recording under disturbances that its own URI names."""
+class DisturbedSource(Wrapped):
+    """A source over another one under disturbances. Thread-safe when the inner source is; equal seeds give equal bits.
 
-    def __init__(self, source: FrameSource, disturbances: Disturbances, seed: int, uri: str) -> None:
-        super().__init__(source, DataOptions(), disturbances, seed)
-        self._uri = uri
+    Frame t of the run is frame ``start + t + offset`` of the recording for each camera, where ``start`` makes room for
+    negative offsets; the run is shorter by the span of the offsets, so that no frame of a camera is shown twice.
+    Order: time offset, gain (all cameras), noise, losses and the rounding of storage (training cameras).
+    """
+
+    def __init__(self, source: Source, disturbances: Disturbances, seed: int, uri: str) -> None:
+        super().__init__(source)
+        self._disturbances, self._rng, info = disturbances, Rng(seed), source.info
+        ids = (*info.train.ids, *info.test.ids)
+        self._offsets = parse_offsets(disturbances.time_offset, ids)
+        self._losses = parse_losses(disturbances.lost_cameras, info.train.ids)
+        used = [self._offsets.get(name, 0) for name in ids]
+        self._start = max(0, -min(used))
+        frames = info.num_frames
+        if frames is not None:
+            frames -= self._start + max(0, *used)
+            if frames < 1:
+                raise SourceError(
+                    f"disturbed source: time_offset: offsets from {min(used)} to {max(used)} leave no common frame of "
+                    f"the {info.num_frames} that {info.name!r} has; use smaller offsets"
+                )
+        self._info = replace(info, uri=uri, num_frames=frames)
 
     @property
     def info(self) -> SourceInfo:
-        """That of the recording, under the URI that brings the disturbances back."""
-        return replace(self._info, uri=self._uri)
+        """The inner recording's, with the frames that are left, under the URI that brings the disturbances back."""
+        return self._info
+
+    def frame(self, index: int, split: Split = "train") -> Frame:
+        """Read one instant. Raises SourceError as the inner source does."""
+        return self.stored_frame(index, split).as_float32()
+
+    def image(self, index: int, camera: str) -> FloatArray:
+        """Return one camera's image under the disturbances."""
+        check_index(self._info, index)
+        options, training = self._disturbances, camera in self._info.train.ids
+        shown = self._delivered_frame(camera, index) if training else index
+        if shown is None:
+            return np.zeros((self._info.train.height, self._info.train.width, 3), np.float32)
+        image = self._source.image(self._start + shown + self._offsets.get(camera, 0), camera)
+        image = with_gain(image, gain_at(options, shown, self._rng))
+        if training and options.noise_sigma > 0 and shown < options.noise_frames:
+            image = with_noise(image, options.noise_sigma, camera, index=shown, rng=self._rng)
+        return image
+
+    def stored_image(self, index: int, camera: str) -> Any:
+        """Return one camera's image under the disturbances as it is stored."""
+        return packed(self.image(index, camera))
+
+    def stored_frame(self, index: int, split: Split = "train") -> Frame:
+        """Read one instant as it is stored. Raises SourceError as the inner source does."""
+        return assembled(self, index, split)
+
+    @property
+    def stores_bytes(self) -> bool:
+        """Whether the inner source hands over bytes, which no gain and no noise takes off their levels."""
+        options = self._disturbances
+        same = options.gain == 1 and options.gain_amplitude == 0 and options.noise_sigma == 0
+        return same and self._source.stores_bytes
+
+    def moment(self, index: int) -> Moment:
+        """Return what the inner source says of an instant, which is there with the last image that it is made of."""
+        moments = {offset: self._source.moment(self._start + index + offset) for offset in self._used_offsets}
+        came = [moment.arrival for moment in moments.values() if moment.arrival is not None]
+        complete = max((arrival.complete for arrival in came if arrival.complete is not None), default=None)
+        missing = {name for arrival in came for name in arrival.absent}
+        ids = (*self._info.train.ids, *self._info.test.ids)
+        return Moment(
+            moments[0].epoch_scale,
+            Arrival(complete, tuple(name for name in self._info.train.ids if name in missing)) if came else None,
+            tuple(name for name in ids if name in moments[self._offsets.get(name, 0)].held),
+        )
+
+    def epoch_scale(self, index: int) -> float:
+        """Return what the inner source says that a frame is worth."""
+        return self._source.epoch_scale(self._start + index)
+
+    @property
+    def _used_offsets(self) -> list[int]:
+        return sorted({0, *self._offsets.values()})
+
+    def _delivered_frame(self, name: str, index: int) -> int | None:
+        """The frame whose image this camera delivers at ``index``; None: a black one."""
+        while is_lost(self._disturbances, self._losses, name, index=index, rng=self._rng):
+            if self._disturbances.lost_as == "black":
+                return None
+            index -= 1
+        return index

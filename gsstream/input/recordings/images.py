@@ -15,7 +15,7 @@ from gsstream.core.shapes import FloatArray
 from gsstream.core.storage import unpacked
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_RGB_COLOR_TYPE = 2
+_RGB_COLOR_TYPE = b"\x02"
 #: The only decoders that Pillow may try: others are many, some start programs (EPS: Ghostscript), none is documented.
 PICTURE_FORMATS = ("PNG", "JPEG")
 #: The EXIF tag that says how viewers turn a picture, and its value for "not at all".
@@ -55,6 +55,13 @@ def read_stored(
     return shrink(pixels, target) / np.float32(full_scale)
 
 
+def scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
+    """Return (width, height) after scaling by a factor in (0, 1], rounded to whole pixels, at least one."""
+    if not 0 < scale <= 1:
+        raise SourceError(f"scale: expected a factor in (0, 1], got {scale!r}; recordings are never enlarged")
+    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
+
+
 def shrink(pixels: np.ndarray[Any, Any], target: tuple[int, int]) -> FloatArray:
     """Average [H, W, 3] pixels down to ``target`` (width, height), at most the present size; float32, same unit."""
     height, width = pixels.shape[:2]
@@ -85,12 +92,21 @@ def _average(lines: np.ndarray[Any, Any], target: int) -> FloatArray:
     return means
 
 
+def is_deep(path: Path) -> bool:
+    """Say whether an image file holds 16 bits per channel: a PNG may; all others that we read hold 8."""
+    head = _head(path)
+    return head.startswith(_PNG_SIGNATURE) and head[24:25] == b"\x10"
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(26)
+
+
 def _decode(path: Path) -> tuple[np.ndarray[Any, Any], float]:
     """Pixels [H, W, 3] uint8 or uint16 and the value that means 1.0."""
     try:
-        with path.open("rb") as file:
-            head = file.read(26)
-        if head.startswith(_PNG_SIGNATURE) and len(head) == 26 and head[24] == 16 and head[25] == _RGB_COLOR_TYPE:
+        if is_deep(path) and _head(path)[25:] == _RGB_COLOR_TYPE:
             return _decode_rgb16(path), 65535.0
         with Image.open(path, formats=PICTURE_FORMATS) as image:
             image.load()

@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from gsstream.core.errors import SourceError
-from gsstream.input.recordings.base import FrameSource
-from gsstream.input.recordings.calibration import CALIBRATION_FILE, read_calibration
+from gsstream.input.recordings.base import Source
 from gsstream.input.recordings.clips import prepare_command
-from gsstream.input.recordings.multiview import MultiviewSource
 from gsstream.input.recordings.recorded import RecordedSource, Recording
 
 DEMO_FOLDER = Path(__file__).parent / "demo" / "pickblocks_tiny_160"
 #: Name -> (module in ``layouts``, what it looks like).
 LAYOUTS = {
+    "folder": ("declared", "cameras.json"),
     "n3dv": ("n3dv", "cam00.mp4 ... or cam00/, and poses_bounds.npy"),
     "meetroom": ("meetroom", "cam_0.mp4 ... or cam_0/, and poses_bounds.npy"),
     "enerf": ("easymocap", "intri.yml, extri.yml, images/00/"),
@@ -30,14 +29,14 @@ _KNOWN = (
     "'synthetic:' with options such as 'synthetic:frames=40&views=8' (an analytic scene of any length), "
     "'watch:DIR' (a folder that is still being written), "
     "'disturbed:KEY=VALUE,...:' before any of them (an experiment), "
-    f"or the path of a folder, read by its layout or as you say: folder:DIR, {':DIR, '.join(LAYOUTS)}:DIR"
+    f"or the path of a folder, read by its layout or as you say: {':DIR, '.join(LAYOUTS)}:DIR"
 )
 
 
-def open_source(uri: str, scale: float = 1.0) -> FrameSource:
+def open_source(uri: str, scale: float = 1.0) -> Source:
     """Open a recording. Raises SourceError for an unknown uri, naming what exists, and for a faulty recording."""
     if uri == "demo":
-        return MultiviewSource(DEMO_FOLDER, scale=scale, uri=uri)
+        return RecordedSource(read_layout("folder", DEMO_FOLDER), scale=scale, uri=uri)
     scheme, separator, rest = uri.partition(":")
     if separator and scheme == "synthetic":
         from gsstream.input.recordings.synthetic import SyntheticSource
@@ -49,29 +48,17 @@ def open_source(uri: str, scale: float = 1.0) -> FrameSource:
         return WatchSource.from_query(rest, scale=scale)
     if separator and scheme == "disturbed":
         return _disturbed(rest, scale, uri)
-    named = scheme if separator and scheme in (*LAYOUTS, "folder") else None
+    named = scheme if separator and scheme in LAYOUTS else None
     folder = Path(rest if named else uri)
     # Path takes an empty text for the current folder, which is never what was meant.
     if not (uri and _exists(folder)) and not named:
         raise SourceError(f"source {uri[:200]!r}: no such folder and no known scheme; expected {_KNOWN}")
     if named == "nerfstudio" and not _exists(folder):
         return _nerfstudio(rest, scale, uri)
-    layout = named or detect(folder)
-    if layout == "folder":
-        return _declared(folder, scale, uri)
-    return RecordedSource(read_layout(layout, folder), scale=scale, uri=uri)
+    return RecordedSource(read_layout(named or detect(folder), folder), scale=scale, uri=uri)
 
 
-def _declared(folder: Path, scale: float, uri: str) -> FrameSource:
-    """A folder with cameras.json."""
-    if not read_calibration(folder).is_raw:
-        return MultiviewSource(folder, scale=scale, uri=uri)
-    from gsstream.input.recordings.layouts.declared import read
-
-    return RecordedSource(read(folder), scale=scale, uri=uri)
-
-
-def _disturbed(rest: str, scale: float, uri: str) -> FrameSource:
+def _disturbed(rest: str, scale: float, uri: str) -> Source:
     """``disturbed:KEY=VALUE,...:URI``. Raises SourceError for an unknown key, and what opening URI raises."""
     from gsstream.input.recordings.disturbed import DisturbedSource, parse_disturbances
 
@@ -87,7 +74,7 @@ def _disturbed(rest: str, scale: float, uri: str) -> FrameSource:
         raise
 
 
-def _nerfstudio(rest: str, scale: float, uri: str) -> FrameSource:
+def _nerfstudio(rest: str, scale: float, uri: str) -> Source:
     """``nerfstudio:DIR?missing=refuse``. Raises SourceError for another option."""
     from gsstream.input.recordings.layouts.nerfstudio import read
 
@@ -112,17 +99,17 @@ def _reader(name: str) -> Any:
 
 
 def layouts_of(folder: Path) -> list[str]:
-    """Names of the layouts that the files of a folder fit."""
+    """Return the names of the layouts that the files of a folder fit; "folder" alone where there is a cameras.json."""
+    if _reader("folder").looks_like(folder):
+        return ["folder"]
     return [name for name in LAYOUTS if _reader(name).looks_like(folder)]
 
 
 def detect(folder: Path) -> str:
-    """Name of the layout of a folder; "folder" for one with cameras.json, which always counts.
+    """Return the name of the layout of a folder; "folder" for one with cameras.json, which always counts.
 
     Raises SourceError when none fits, saying what would, or when several do, saying how to choose.
     """
-    if (folder / CALIBRATION_FILE).is_file():
-        return "folder"
     found = layouts_of(folder)
     if len(found) == 1:
         return found[0]
@@ -131,7 +118,7 @@ def detect(folder: Path) -> str:
         raise SourceError(f"{folder}: the files fit several layouts: {told}. Say which: --source {found[0]}:{folder}")
     known = "; ".join(f"{name}: {looks}" for name, (_, looks) in LAYOUTS.items())
     raise SourceError(
-        f"{folder}: no known layout. Expected {CALIBRATION_FILE}, or one of these: {known}. Videos or images without a "
+        f"{folder}: no known layout. Expected one of these: {known}. Videos or images without a "
         f"calibration: {prepare_command(str(folder))}"
     )
 

@@ -1,13 +1,28 @@
-"""Coloured points from PLY files, as 3D tools write them: ascii or little-endian binary, one row per vertex."""
+"""Coloured points of frame 0 from files: numpy archives beside cameras.json, and PLY as 3D tools write it.
+
+PLY: ascii or little-endian binary, one row per vertex.
+"""
 
 from __future__ import annotations
 
+import warnings
+import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
 
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import PointCloud
+from gsstream.core.shapes import BoolArray, FloatArray
+from gsstream.input.recordings.base import PointKind
+from gsstream.input.recordings.sync import RecordingWarning
+
+POINTS_FILE = "points_frame0.npz"
+#: Points that whoever made them trusts less than this, from 0 to 1, are left out.
+TRUSTED = 0.5
+#: Steps of float32 above this share of the points' spread move them visibly.
+COARSE = 1e-3
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4", "float": "<f4",
@@ -17,6 +32,63 @@ _TYPES = {
 #: Longest header we read; a file without an end of header is not a PLY.
 _HEADER_LIMIT = 65536
 _MAX_POINTS = 200_000_000
+
+
+def read_points(path: Path, kind: PointKind) -> PointCloud:
+    """Read [P, 3] points and uint8 colours from an npz file, without those of a ``confidence`` [P] below a half.
+
+    Raises SourceError naming file and array.
+    """
+    prefix = "" if kind == "recording" else "sparse_"
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            if not isinstance(arrays, np.lib.npyio.NpzFile):
+                raise ValueError("it holds a single array (.npy)")
+            names = list(arrays.files)
+            missing = [n for n in (f"{prefix}xyz", f"{prefix}rgb") if n not in names]
+            if missing:
+                raise SourceError(f"{path}: no array {missing[0]!r} for points {kind!r}; it holds {', '.join(names)}")
+            xyz, rgb = arrays[f"{prefix}xyz"], arrays[f"{prefix}rgb"]
+            trust = arrays[f"{prefix}confidence"] if f"{prefix}confidence" in names else None
+    except SourceError:
+        raise
+    except (OSError, ValueError, EOFError, TypeError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
+        raise SourceError(f"{path}: cannot be read as a numpy archive: {error}; write it with numpy.savez") from error
+    shaped = xyz.ndim == 2 and xyz.shape[1] == 3 and rgb.shape == xyz.shape
+    if not shaped or rgb.dtype != np.uint8 or xyz.dtype.kind not in "fiu":
+        raise SourceError(
+            f"{path}: expected {prefix}xyz [P, 3] float and {prefix}rgb [P, 3] uint8, "
+            f"got {list(xyz.shape)} {xyz.dtype} and {list(rgb.shape)} {rgb.dtype}"
+        )
+    with np.errstate(over="ignore"):  # what does not fit into float32 becomes infinite and is refused
+        fits = np.isfinite(xyz.astype(np.float32))
+    if not fits.all():
+        raise SourceError(f"{path}: {int((~fits).any(1).sum())} of {len(xyz)} points are not finite")
+    if xyz.dtype == np.float32 and len(xyz) > 1:
+        step = float(np.spacing(np.abs(xyz).max()))
+        spread = float(np.median(np.abs(xyz - np.median(xyz, axis=0))))
+        if step > COARSE * spread:
+            warnings.warn(
+                f"{path}: {prefix}xyz is float32, whose steps are {step:.2g} this far from the origin, and the points "
+                f"spread over {spread:.2g}: write float64, or move poses and points to the origin",
+                RecordingWarning,
+                stacklevel=2,
+            )
+    if trust is not None:
+        kept = _trusted(path, f"{prefix}confidence", trust, len(xyz))
+        xyz, rgb = xyz[kept], rgb[kept]
+    colors = rgb.astype(np.float32) / np.float32(255)
+    return PointCloud(xyz.astype(np.float64), colors, f"{path.name} ({kind})")
+
+
+def _trusted(path: Path, name: str, trust: FloatArray, count: int) -> BoolArray:
+    """[P] bool: which points their maker trusts. Raises SourceError for other numbers, and where none are left."""
+    if trust.shape != (count,) or trust.dtype.kind not in "fiu" or not ((trust >= 0) & (trust <= 1)).all():
+        raise SourceError(f"{path}: expected {name} [{count}] from 0 to 1, got {list(trust.shape)} {trust.dtype}")
+    kept: BoolArray = trust >= TRUSTED
+    if not kept.any():
+        raise SourceError(f"{path}: {name} is below {TRUSTED} for every point: scale it to 1, or leave the array out")
+    return kept
 
 
 def read_ply_points(path: Path) -> PointCloud:

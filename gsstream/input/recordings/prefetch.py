@@ -5,16 +5,11 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
 from types import TracebackType
-from typing import Any
-
-import numpy as np
 
 from gsstream.core.errors import EndOfRecording, GsstreamError, InputError, SourceError
 from gsstream.core.frame import Frame
-from gsstream.core.storage import packed
-from gsstream.input.recordings.base import FrameSource, LiveSource, SingleImages, StoredImages
+from gsstream.input.recordings.base import Source
 from gsstream.input.recordings.canonical import to_file_coordinates
 
 FramePair = tuple[Frame, Frame]
@@ -32,7 +27,7 @@ class Prefetcher:
 
     def __init__(
         self,
-        source: FrameSource,
+        source: Source,
         indices: Iterable[int],
         *,
         depth: int | None = None,
@@ -82,8 +77,7 @@ class Prefetcher:
             future.cancel()
         self._pending.clear()
         self._todo = iter(())
-        if isinstance(self._source, LiveSource):
-            self._source.interrupt()
+        self._source.interrupt()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _submit(self) -> None:
@@ -93,48 +87,17 @@ class Prefetcher:
             break
 
 
-def _pair_bytes(source: FrameSource) -> int:
+def _pair_bytes(source: Source) -> int:
     """Bytes of the images of one frame of all cameras, as float32."""
     return sum(12 * len(rig) * rig.width * rig.height for rig in (source.info.train, source.info.test))
 
 
-def _packed_views(source: FrameSource, index: int) -> Any:
-    """[C, H, W, 3] uint8: the training images read and packed one by one, so that no whole frame is float32 on the way.
-
-    None where a source cannot read single images, or bytes do not hold them.
-    """
-    single, cameras = to_file_coordinates(source), source.info.train
-    if not isinstance(single, SingleImages) or isinstance(single, LiveSource):
-        return None
-    views = np.empty((len(cameras), cameras.height, cameras.width, 3), np.uint8)
-    for out, name in zip(views, cameras.ids, strict=True):
-        if isinstance(single, StoredImages):
-            view = packed(single.stored_image(index, name))
-        else:
-            view = packed(single.image(index, name))
-        if view.dtype != np.uint8 or view.shape != out.shape:
-            return None
-        out[...] = view
-    return views
-
-
-def _packed_frame(frame: Frame) -> Frame:
-    return replace(frame, images=packed(frame.images))
-
-
-def _read_pair(source: FrameSource, index: int, pack: bool) -> FramePair:
+def _read_pair(source: Source, index: int, pack: bool) -> FramePair:
+    read = source.stored_frame if pack else source.frame
     try:
-        views = _packed_views(source, index) if pack else None
-        if views is not None:
-            # All but the images is that of the test cameras' frame of the same instant.
-            test = _packed_frame(source.frame(index, "test"))
-            return replace(test, images=views, cameras=source.info.train), test
-        pair = source.frame(index, "train"), source.frame(index, "test")
-        if pack:
-            pair = _packed_frame(pair[0]), _packed_frame(pair[1])
+        return read(index, "train"), read(index, "test")
     except GsstreamError:
         raise
     except Exception as error:  # a source may be a plugin's: its failure is reported with its name
         name = type(to_file_coordinates(source)).__name__
         raise SourceError(f"{name} could not read frame {index}: {type(error).__name__}: {error}") from error
-    return pair

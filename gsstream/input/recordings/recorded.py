@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,11 +14,12 @@ from gsstream.core.errors import ShapeError, SourceError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.names import check_camera_ids
 from gsstream.core.shapes import BoolArray, FloatArray
-from gsstream.input.recordings.base import PointKind, SourceInfo, Split, check_index
+from gsstream.core.storage import packed, to_bytes, unpacked
+from gsstream.input.recordings.base import PointKind, Source, SourceInfo, Split, assembled, check_index
 from gsstream.input.recordings.clips import Clip, prepare_command
 from gsstream.input.recordings.depth_maps import FOLDER
 from gsstream.input.recordings.distortion import Lens, Undistorter, pinhole_intrinsics
-from gsstream.input.recordings.multiview import scaled_size
+from gsstream.input.recordings.images import scaled_size
 from gsstream.input.recordings.sync import align
 
 
@@ -42,12 +44,13 @@ class Recording:
     lenses: Mapping[str, Lens] = field(default_factory=dict)  # camera id -> distortion, where there is any
     #: Camera id -> (width, height) of its pictures; empty: all have those of the rig.
     sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
-    points: Callable[[], SeenPoints | None] = lambda: None  # reads points of frame 0; None when none ship
+    #: Reads points of frame 0, the sparse ones where it has two kinds; None when none ship.
+    points: Callable[[PointKind], SeenPoints | None] = lambda _: None
     licence: str = ""
     folder: Path | None = None  # the recording's, in which it may keep what else is known of frame 0
 
 
-class RecordedSource:
+class RecordedSource(Source):
     """Frames of a :class:`Recording`, area-averaged to ``scale``. Thread-safe.
 
     Cameras with distortion are resampled on reading, to the widest pinhole image without empty corners; ``info`` holds
@@ -83,18 +86,30 @@ class RecordedSource:
 
     def frame(self, index: int, split: Split = "train") -> Frame:
         """Read one instant. Raises SourceError naming the file when a picture is missing or damaged."""
-        cameras = self._info.train if split == "train" else self._info.test
-        check_index(self._info, index)
-        images: FloatArray = np.empty((len(cameras), cameras.height, cameras.width, 3), np.float32)
-        for row, name in enumerate(cameras.ids):
-            images[row] = self.image(index, name)
-        return Frame(index, index / self._info.fps, images, cameras)
+        return self.stored_frame(index, split).as_float32()
 
     def image(self, index: int, camera: str) -> FloatArray:
         """Return one camera's image [H, W, 3] float32 in [0, 1]."""
+        return unpacked(self.stored_image(index, camera))
+
+    def stored_image(self, index: int, camera: str) -> Any:
+        """Return one camera's image as it is stored; an undistorted one has the levels of the picture it is made of."""
         check_index(self._info, index)
         image = self._recording.clips[camera].read(index + self._alignment.skip[camera], self._target)
-        return self._undistort[camera](image) if camera in self._undistort else image
+        if camera not in self._undistort:
+            return packed(image)
+        flat = self._undistort[camera](unpacked(image))
+        return to_bytes(flat) if image.dtype == np.uint8 else packed(flat)
+
+    def stored_frame(self, index: int, split: Split = "train") -> Frame:
+        """Read one instant as it is stored."""
+        return assembled(self, index, split)
+
+    @property
+    def stores_bytes(self) -> bool:
+        """Whether pictures have 8 bits and are read at their size."""
+        rig, clips = self._recording.rig, self._recording.clips.values()
+        return self._target == (rig.width, rig.height) and not any(clip.deep for clip in clips)
 
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
         """Return the points that ship, without those in which a test camera took part; None when none are left."""
@@ -102,7 +117,7 @@ class RecordedSource:
 
     def points_without(self, cameras: Sequence[str], kind: PointKind = "recording") -> PointCloud | None:
         """Return the points in which none of these cameras took part; None when none are left."""
-        found = self._recording.points()
+        found = self._recording.points(kind)
         if found is None:
             return None
         barred = [i for i, name in enumerate(self._recording.rig.ids) if name in cameras]

@@ -12,8 +12,8 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import BoolArray, FloatArray
-from gsstream.input.recordings.base import PointKind, SourceInfo, Split, check_index
-from gsstream.input.recordings.multiview import scaled_size
+from gsstream.input.recordings.base import PointKind, Source, SourceInfo, Split, assembled, check_index
+from gsstream.input.recordings.images import scaled_size
 from gsstream.input.recordings.options import options_of_query
 from gsstream.input.recordings.primitives import Hits, Placed, cast, lit
 from gsstream.input.recordings.toyroom import LIGHT, arc_cameras
@@ -48,7 +48,7 @@ class SyntheticOptions(BaseModel):
     supersample: int = Field(default=2, ge=1, le=8, description="rays per pixel side")
 
 
-class SyntheticSource:
+class SyntheticSource(Source):
     """Objects move on known paths among static ones, inside a textured room; all surfaces are finite.
 
     Images are quantised to 8 bits after noise. Thread-safe; the same options give the same bits.
@@ -85,10 +85,22 @@ class SyntheticSource:
 
     def frame(self, index: int, split: Split = "train") -> Frame:
         """Ray-cast one instant. Raises SourceError for an index outside the recording."""
+        return self.stored_frame(index, split).as_float32()
+
+    def image(self, index: int, camera: str) -> FloatArray:
+        """Ray-cast one camera's image. Raises SourceError for an index outside the recording."""
         check_index(self._info, index)
-        cameras = self._info.train if split == "train" else self._info.test
-        images = np.stack([self._image(cameras, i, index) for i in range(len(cameras))])
-        return Frame(index, index / self._info.fps, images, cameras)
+        rig = self._info.train if camera in self._info.train.ids else self._info.test
+        return self._image(rig, rig.ids.index(camera), index)
+
+    def stored_frame(self, index: int, split: Split = "train") -> Frame:
+        """Ray-cast one instant, with images of uint8."""
+        return assembled(self, index, split)
+
+    @property
+    def stores_bytes(self) -> bool:
+        """True: images are quantised to 8 bits."""
+        return True
 
     def points(self, kind: PointKind = "recording") -> PointCloud:
         """Return points on the surfaces seen by the training cameras at frame 0.

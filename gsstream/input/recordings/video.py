@@ -13,7 +13,6 @@ import numpy as np
 
 from gsstream.core.errors import SourceError
 from gsstream.core.install_hints import install_extra
-from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.images import shrink
 
 
@@ -100,7 +99,11 @@ class VideoClip:
         first = int(np.flatnonzero(np.abs(off) >= 0.5 * abs(off[worst]))[0]) if off[worst] else 0
         return first, float(off[worst])
 
-    def read(self, index: int, target: tuple[int, int]) -> FloatArray:
+    @property
+    def deep(self) -> bool:
+        return self._deep
+
+    def read(self, index: int, target: tuple[int, int]) -> Any:
         """Decode one picture. Raises SourceError naming file and frame when the data is damaged."""
         with self._lock, self._guard(f"decoded at frame {index}"):
             try:
@@ -108,6 +111,8 @@ class VideoClip:
             except BaseException:
                 self._drop()
                 raise
+        if target == self._size and not self._deep:
+            return pixels
         return shrink(pixels, target) / np.float32(65535 if self._deep else 255)
 
     def close(self) -> None:

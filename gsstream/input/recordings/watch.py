@@ -9,25 +9,25 @@ from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from gsstream.core.errors import EndOfRecording, SourceError
 from gsstream.core.frame import Arrival, Frame, PointCloud
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.base import PointKind, SourceInfo, Split
+from gsstream.core.storage import packed, unpacked
+from gsstream.input.recordings.base import Moment, PointKind, Source, SourceInfo, Split, assembled
 from gsstream.input.recordings.calibration import CALIBRATION_FILE, Calibration, frame_path, is_video, read_calibration
 from gsstream.input.recordings.depth_maps import FOLDER
-from gsstream.input.recordings.images import read_image
-from gsstream.input.recordings.multiview import POINTS_FILE, read_points, scaled_size
+from gsstream.input.recordings.images import read_stored, scaled_size
 from gsstream.input.recordings.options import WatchOptions, options_of_query
+from gsstream.input.recordings.pointfiles import POINTS_FILE, read_points
 
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
     """What is delivered as one frame: ``epoch_scale``, and from which earlier frame cameras are held.
 
-    ``skipped``: the run is behind; its files are not read, and the last images of all training cameras stand in.
+    ``skipped``: the run is behind; its files are not read, and the last images of all cameras stand in.
     """
 
     epoch_scale: float = 1.0
@@ -38,7 +38,7 @@ class _Plan:
 _WHOLE = _Plan()
 
 
-class WatchSource:
+class WatchSource(Source):
     """Frames of a growing folder in the layout of cameras.json. ``frame`` waits until the frame is there.
 
     A frame once delivered never changes: a file that is written again later is not read again. ``info.uri`` is the
@@ -67,7 +67,7 @@ class WatchSource:
         )
         self._plans: dict[int, _Plan] = {}  # only frames that are not delivered whole
         self._next, self._skip_to, self._newest = 0, 0, 0
-        self._decoded: dict[tuple[str, int], FloatArray] = {}  # of the frame that is waited for
+        self._decoded: dict[tuple[str, int], Any] = {}  # of the frame that is waited for
         self._faults: dict[str, str] = {}
         self._last: dict[str, int] = {}
         self._stop, self._planning = threading.Event(), threading.Lock()
@@ -91,25 +91,33 @@ class WatchSource:
         Raises EndOfRecording when the recording ended before it. Test cameras are left out of a frame in which one of
         them is absent, so that nothing is measured against an image of another time.
         """
-        if index < 0:
-            raise SourceError(f"recording {self._info.name!r} has no frame {index}; frames are counted from 0")
+        return self.stored_frame(index, split).as_float32()
+
+    def image(self, index: int, camera: str) -> FloatArray:
+        """Wait for one instant and read one camera's image, or its last one where it is absent."""
+        return unpacked(self.stored_image(index, camera))
+
+    def stored_image(self, index: int, camera: str) -> Any:
+        """Wait for one instant and read one camera's image as it is stored, or its last one where it is absent."""
+        shown = dict(self._plan(index).held).get(camera, index)
+        # The image that was decoded to see that it is whole, while it is at hand; else read again.
+        ready = self._decoded.get((camera, shown))
+        return self._read(camera, shown) if ready is None else ready
+
+    def stored_frame(self, index: int, split: Split = "train") -> Frame:
+        """Wait for one instant and read it as it is stored."""
+        return assembled(self, index, split)
+
+    @property
+    def stores_bytes(self) -> bool:
+        """Whether images are read at their size; those still to come are taken for 8-bit ones, as nearly all are."""
+        return self._target == self._native
+
+    def moment(self, index: int) -> Moment:
+        """Wait for one instant and return how it came in."""
         plan = self._plan(index)
-        cameras = self._info.train if split == "train" else self._info.test
         held = dict(plan.held)
-        if split == "test" and (plan.skipped or any(camera_id in held for camera_id in cameras.ids)):
-            cameras = cameras.select([])
-        images: FloatArray = np.empty((len(cameras), self._target[1], self._target[0], 3), np.float32)
-        for i, camera_id in enumerate(cameras.ids):
-            images[i] = self._image(camera_id, held.get(camera_id, index))
-        arrival = self._arrival(index, () if plan.skipped else held)
-        return Frame(
-            index=index,
-            timestamp=index / self._info.fps,
-            images=images,
-            cameras=cameras,
-            epoch_scale=plan.epoch_scale,
-            arrival=arrival,
-        )
+        return Moment(plan.epoch_scale, self._arrival(index, () if plan.skipped else held), tuple(held))
 
     def epoch_scale(self, index: int) -> float:
         """Return what a frame is worth now that its turn has come: more may wait than when it was read ahead."""
@@ -133,16 +141,16 @@ class WatchSource:
         came = self._newest_of(set(self._ids).difference(held), index)
         return Arrival(came, tuple(name for name in self._info.train.ids if name in held))
 
-    def _image(self, camera_id: str, index: int) -> FloatArray:
-        """The image that was decoded to see that it is whole, while it is at hand; else read again."""
-        ready = self._decoded.get((camera_id, index))
-        return read_image(self._path(camera_id, index), self._native, self._target) if ready is None else ready
+    def _read(self, camera_id: str, index: int) -> Any:
+        return packed(read_stored(self._path(camera_id, index), self._native, self._target))
 
     def _path(self, camera_id: str, index: int) -> Path:
         return self._folder / frame_path(self._patterns[camera_id], index)
 
     def _plan(self, index: int) -> _Plan:
-        """Return the plan of a frame, which is made once and kept."""
+        """Return the plan of a frame, which is made once and kept. Raises EndOfRecording where there is no frame."""
+        if index < 0:
+            raise SourceError(f"recording {self._info.name!r} has no frame {index}; frames are counted from 0")
         if index >= self._next:
             with self._planning:
                 while self._next <= index:
@@ -159,7 +167,7 @@ class WatchSource:
         if self._info.num_frames is not None and index >= self._info.num_frames:
             raise EndOfRecording(f"the recording ended after {self._info.num_frames} frames")
         if 0 < index < self._skip_to:  # images of all training cameras came, and newer ones
-            return _Plan(0.0, tuple((name, self._last[name]) for name in self._info.train.ids), skipped=True)
+            return _Plan(0.0, tuple((name, self._last[name]) for name in self._ids), skipped=True)
         absent = self._wait(index)
         untrained = [name for name in absent if name in self._train]
         held = tuple((name, self._last[name]) for name in absent)
@@ -229,7 +237,7 @@ class WatchSource:
     def _decodes(self, name: str, index: int) -> bool:
         """A writer may stall in the middle of a file; what does not decode is not there yet."""
         try:
-            self._decoded[name, index] = read_image(self._path(name, index), self._native, self._target)
+            self._decoded[name, index] = self._read(name, index)
         except SourceError as error:
             self._faults[name] = str(error)
             return False

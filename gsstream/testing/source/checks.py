@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -10,23 +11,26 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame, PointCloud
-from gsstream.core.shapes import check_finite, check_shape
-from gsstream.core.storage import unpacked
-from gsstream.input.recordings.base import FrameSource, SingleImages, Split, StoredImages
-from gsstream.testing.recording import Skip, SourceUnderTest
+from gsstream.core.shapes import FloatArray, check_finite, check_shape
+from gsstream.core.storage import packed
+from gsstream.input.recordings.base import Source, Split, Wrapped
+from gsstream.input.recordings.canonical import CanonicalSource, recording_similarity
+from gsstream.input.recordings.options import DataOptions
+from gsstream.input.recordings.transformed import transformed
+from gsstream.testing.recording import SourceUnderTest
 from gsstream.testing.registry import check
 
 SPLITS: tuple[Split, ...] = ("train", "test")
 THREADS = 4
 
 
-def _some(source: FrameSource) -> list[int]:
+def _some(source: Source) -> list[int]:
     """First, second and last frame; of a recording that grows the first alone, because others may be waited for."""
     number = source.info.num_frames
     return [0] if number is None else sorted({0, min(1, number - 1), number - 1})
 
 
-def _rig(source: FrameSource, split: Split) -> Cameras:
+def _rig(source: Source, split: Split) -> Cameras:
     return source.info.train if split == "train" else source.info.test
 
 
@@ -43,6 +47,7 @@ def _same_images(what: str, got: Frame, expected: Frame) -> None:
 def check_source_info(subject: SourceUnderTest) -> None:
     """It has a name, a frame rate, frames, at least one training camera, and no camera in both splits."""
     with subject.open() as source:
+        assert isinstance(source, Source), f"expected a subclass of gsstream.api.Source, got {type(source).__name__}"
         info = source.info
     assert info.name, "info.name is empty"
     assert np.isfinite(info.fps) and info.fps > 0, f"info.fps: expected frames per second, got {info.fps}"
@@ -171,16 +176,69 @@ def check_source_scale(subject: SourceUnderTest) -> None:
 
 @check("source")
 def check_source_single_images(subject: SourceUnderTest) -> None:
-    """One camera's image, where it is offered, has the bits that it has in the frame, stored as bytes or not."""
-    with subject.open() as source:
-        offered: Any = source
-        if not isinstance(source, SingleImages):
-            raise Skip("offers no single images (optional: image(index, camera))")
-        for split in SPLITS:
-            frame = source.frame(0, split)
-            for place, camera in enumerate(frame.cameras.ids):
-                single = offered.image(0, camera)
-                assert np.array_equal(single, frame.images[place]), f"camera {camera!r}: not the image of the frame"
-                if isinstance(source, StoredImages):
-                    stored = unpacked(source.stored_image(0, camera))
-                    assert np.array_equal(stored, single), f"camera {camera!r}: another image where it is stored"
+    """One camera's image has the bits that it has in the frame; under every split and in a run's coordinates, too."""
+    with subject.open() as opened:
+        for what, source in _wrapped(opened):
+            for split in SPLITS:
+                frame = source.frame(0, split)
+                for place, camera in enumerate(frame.cameras.ids):
+                    where = f"{what}: camera {camera!r}"
+                    single = source.image(0, camera)
+                    assert np.array_equal(single, frame.images[place]), f"{where}: not the image of the frame"
+
+
+@check("source")
+def check_source_stored_images(subject: SourceUnderTest) -> None:
+    """Stored images are the images as bytes where bytes hold them, always where ``stores_bytes`` says so.
+
+    Under every split and in a run's coordinates, too.
+    """
+    with subject.open() as opened:
+        for what, source in _wrapped(opened):
+            for split in SPLITS:
+                frame, stored = source.frame(0, split), source.stored_frame(0, split)
+                for camera in frame.cameras.ids:
+                    _same_stored(f"{what}: camera {camera!r}", source.stored_image(0, camera), source.image(0, camera))
+                _same_stored(f"{what}: frame 0, {split}", stored.images, frame.images)
+                assert stored.images.dtype == np.uint8 or not source.stores_bytes, (
+                    f"{what}: frame 0, {split}: stores_bytes is true, expected uint8, got {stored.images.dtype}"
+                )
+                same = (stored.cameras.ids, stored.epoch_scale) == (frame.cameras.ids, frame.epoch_scale)
+                assert same, f"{what}: frame 0, {split}: the stored frame differs in more than its images"
+
+
+@check("source")
+def check_source_wrapped(subject: SourceUnderTest) -> None:
+    """Under every split and in a run's coordinates it answers as it does as it is opened."""
+    own = {name for name in vars(Source) if not name.startswith("_")}
+    assert not own - set(vars(Wrapped)), f"Wrapped does not forward {', '.join(sorted(own - set(vars(Wrapped))))}"
+    with subject.open() as opened:
+        for what, source in _wrapped(opened):
+            for name in ("stores_bytes", "epoch_scale", "moment"):
+                answers = [getattr(one, name) for one in (source, opened)]
+                wrapped, plain = (answer(0) if callable(answer) else answer for answer in answers)
+                assert wrapped == plain, f"{what}: {name}: expected {plain}, got {wrapped}"
+            held_out = opened.points_without((*opened.info.test.ids, *source.info.test.ids))
+            for cloud in (source.points(), source.points_without(source.info.test.ids)):
+                got, expected = (0 if points is None else len(points) for points in (cloud, held_out))
+                assert got <= expected, f"{what}: {got} points, only {expected} of them without its test cameras"
+            source.interrupt()
+
+
+def _wrapped(source: Source) -> Iterator[tuple[str, Source]]:
+    """The source as it is opened, and as runs with the options of ``data`` see it."""
+    yield "as opened", source
+    ids = source.info.train.ids
+    splits: dict[str, dict[str, Any]] = {"the recording's own split": {}}
+    if len(ids) > 1:
+        splits |= {f"test_cameras=[{ids[0]}]": {"test_cameras": ids[:1]}, "split=tuning": {"split": "tuning"}}
+        splits |= {"train_views=2": {"train_views": 2}}
+    world = recording_similarity(source)
+    for what, options in splits.items():
+        yield what, CanonicalSource(transformed(source, DataOptions(**options)), world)
+
+
+def _same_stored(where: str, stored: Any, image: FloatArray) -> None:
+    expected = packed(image)
+    assert stored.dtype == expected.dtype, f"{where}: expected {expected.dtype} where it is stored, got {stored.dtype}"
+    assert np.array_equal(stored, expected), f"{where}: another image where it is stored"

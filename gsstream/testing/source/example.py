@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsstream.api import Cameras, Frame, PointCloud, SourceError, SourceInfo
+from gsstream.api import Cameras, Frame, PointCloud, Source, SourceError, SourceInfo
 
 SIZE, FRAMES = 32, 5
 
@@ -17,7 +17,7 @@ def rig(ids: tuple[str, ...], size: int) -> Cameras:
     return Cameras(ids=ids, viewmats=viewmats, Ks=np.tile(K, (len(ids), 1, 1)), width=size, height=size)
 
 
-class ExampleSource:
+class ExampleSource(Source):
     """Opened as ``NAME:ANYTHING``; replace what is drawn in ``image`` by what you read."""
 
     def __init__(self, uri: str, scale: float) -> None:
@@ -25,7 +25,7 @@ class ExampleSource:
             raise SourceError(f"{uri}: scale {scale} gives no whole number of pixels; expected 1, 0.5 or 0.25")
         self.size = int(scale * SIZE)
         train, test = rig(("left", "middle", "right"), self.size), rig(("test",), self.size)
-        self.info = SourceInfo(
+        self._info = SourceInfo(
             name="square",
             uri=uri,
             num_frames=FRAMES,
@@ -34,6 +34,11 @@ class ExampleSource:
             test=test,
             licence="made here, free for any use",
         )
+
+    @property
+    def info(self) -> SourceInfo:
+        """What the recording says about itself; cameras at the size that ``frame`` delivers."""
+        return self._info
 
     def image(self, index: int, camera: str) -> np.ndarray:
         """Return [H, W, 3] float32 in [0, 1]; here every camera sees the same."""
@@ -49,6 +54,11 @@ class ExampleSource:
         cameras = self.info.train if split == "train" else self.info.test
         images = np.stack([self.image(index, camera) for camera in cameras.ids])
         return Frame(index, index / self.info.fps, images, cameras)
+
+    @property
+    def stores_bytes(self) -> bool:
+        """True where all images hold the 256 levels of 8 bits; a budget of memory counts on it."""
+        return True
 
     def points(self, kind: str = "recording") -> PointCloud | None:
         """Return points of frame 0; None where the recording has none: they are then found in the training images."""

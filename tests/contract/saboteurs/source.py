@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from gsstream.core.frame import Frame, PointCloud
+from gsstream.core.storage import to_bytes
 from gsstream.testing.recording import SourceUnderTest
 from gsstream.testing.source.example import ExampleSource
 from saboteurs.register import spoils
@@ -35,12 +36,17 @@ class Peeper(ExampleSource):
 
     def __init__(self, uri: str, scale: float) -> None:
         super().__init__(uri, scale)
-        self.info = replace(self.info, test=self.info.train.select([1]))
+        self._info = replace(self.info, test=self.info.train.select([1]))
+
+    def points(self, kind: str = "recording") -> PointCloud | None:
+        return None
 
 
 @_spoils("check_source_frames")
 class Bytes(ExampleSource):
     """Images from 0 to 255."""
+
+    stores_bytes = False
 
     def image(self, index: int, camera: str) -> np.ndarray:
         return super().image(index, camera) * np.float32(255)
@@ -50,6 +56,7 @@ class Bytes(ExampleSource):
 class AutoExposure(ExampleSource):
     """Every opening has an exposure of its own."""
 
+    stores_bytes = False
     openings = itertools.count(1)
 
     def __init__(self, uri: str, scale: float) -> None:
@@ -112,7 +119,7 @@ class SameIntrinsics(ExampleSource):
             replace(rig, Ks=ExampleSource(uri, 1.0).info.train.Ks[: len(rig)])
             for rig in (self.info.train, self.info.test)
         )
-        self.info = replace(self.info, train=train, test=test)
+        self._info = replace(self.info, train=train, test=test)
 
 
 @_spoils("check_source_single_images")
@@ -125,3 +132,24 @@ class UpsideDown(ExampleSource):
     def frame(self, index: int, split: str = "train") -> Frame:
         frame = super().frame(index, split)
         return replace(frame, images=np.ascontiguousarray(frame.images[:, :, ::-1]))
+
+
+@_spoils("check_source_stored_images")
+class Rounder(ExampleSource):
+    """Images are of no whole levels, and rounded where they are stored."""
+
+    stores_bytes = False
+
+    def image(self, index: int, camera: str) -> np.ndarray:
+        return super().image(index, camera) * np.float32(0.9)
+
+    def stored_image(self, index: int, camera: str) -> np.ndarray:
+        return to_bytes(self.image(index, camera))
+
+
+@_spoils("check_source_wrapped")
+class Forgetful(ExampleSource):
+    """Nobody took part in its points, and more of them are left without some cameras than there are with them."""
+
+    def points_without(self, cameras: Sequence[str], kind: str = "recording") -> PointCloud | None:
+        return self.points(kind) if cameras == self.info.test.ids else None

@@ -251,7 +251,7 @@ BAD = (
     BadScene("opengl", "poses with OpenGL axes", "axes", lambda f, d: poses(d, lambda m: FLIP @ m)),
     BadScene("turned-away", "one camera looks the other way", "overlap", lambda f, d: poses(d, turned, "cam02")),
     BadScene("truncated-image", "half an image", "images", truncate),
-    BadScene("wrong-size", "images of another size than declared", "images", resize),
+    BadScene("wrong-size", "images of another size than declared", "calibration", resize),
     BadScene("black", "a black camera", "blank", lambda f, d: pictures(f, "cam03", lambda i, t: 0 * i)),
     BadScene("black-frame", "one black frame", "blank", lambda f, d: save(
         f / "cam03/000004.png", 0 * load(f / "cam03/000004.png")

@@ -151,7 +151,9 @@ def test_meet_room_counts_its_cameras(tmp_path: Path) -> None:
 
 def test_no_layout_and_several_layouts_are_told_apart(tmp_path: Path, world: World) -> None:
     (tmp_path / "empty").mkdir()
-    with pytest.raises(SourceError, match=r"no known layout\. Expected cameras\.json, or .*n3dv: cam00.*scene prepare"):
+    with pytest.raises(
+        SourceError, match=r"no known layout\. Expected .*folder: cameras\.json; n3dv: cam00.*scene prepare"
+    ):
         open_source(str(tmp_path / "empty"))
     folder = write_colmap(tmp_path / "both", world, frames="folders")
     other = LAYOUTS["nerfstudio"].write(tmp_path / "other", world)

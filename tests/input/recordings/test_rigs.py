@@ -13,7 +13,6 @@ from PIL import Image
 
 from gsstream.core.errors import SourceError
 from gsstream.input.prepare.given import read_raw
-from gsstream.input.recordings.multiview import MultiviewSource
 from gsstream.input.recordings.open import detect, open_source, read_layout
 from gsstream.input.recordings.options import DataOptions
 from gsstream.input.recordings.poses import from_rotation_vector, invert
@@ -282,8 +281,6 @@ def test_cameras_json_takes_videos_and_lenses_without_naming_its_schema(tmp_path
     assert [len(list(camera.frames(None))) for camera in raw] == [2, 2, 2]
     declared(folder, 1)
     assert open_source(str(folder)).info.num_frames == 1
-    with pytest.raises(SourceError, match="which open_source reads"):
-        MultiviewSource(folder)
 
 
 @pytest.mark.parametrize(

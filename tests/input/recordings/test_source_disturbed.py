@@ -14,10 +14,12 @@ import pytest
 from gsstream.core.errors import EndOfRecording, SourceError
 from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.run.recording import reopen_recording
+from gsstream.input.recordings.base import Wrapped
+from gsstream.input.recordings.disturbed import DisturbedSource
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
 from gsstream.input.recordings.options import DataOptions, Disturbances
 from gsstream.input.recordings.sync import RecordingWarning
-from gsstream.input.recordings.transformed import TransformedSource, transformed
+from gsstream.input.recordings.transformed import transformed
 
 WORLD = "synthetic:frames=12&views=4&width=16&height=12&supersample=1&motion=3"
 CASES: dict[str, tuple[str, dict[str, Any], int]] = {
@@ -38,7 +40,7 @@ def test_the_text_is_the_options_bit_by_bit(case, uri) -> None:
     plain = open_source(uri)
     name = plain.info.train.ids[2]
     options = {k: tuple(e.replace("NAME", name) for e in v) if isinstance(v, tuple) else v for k, v in options.items()}
-    expected = TransformedSource(plain, DataOptions(), Disturbances(**options), seed)
+    expected = DisturbedSource(plain, Disturbances(**options), seed, uri)
     whole = f"disturbed:{text.replace('NAME', name)}:{uri}"
     found = open_source(whole)
     assert found.info.uri == whole
@@ -146,15 +148,11 @@ def test_frame_0_needs_every_image(damaged) -> None:
 
 
 def test_the_end_of_a_recording_is_no_bad_image() -> None:
-    class Ended:
-        def __init__(self, inner: Any) -> None:
-            self.info = inner.info
-            self.inner = inner
-
-        def frame(self, index: int, split: str = "train") -> Any:
+    class Ended(Wrapped):
+        def stored_image(self, index: int, camera: str) -> Any:
             if index > 2:
                 raise EndOfRecording("the recording ended after 3 frames")
-            return self.inner.frame(index, split)
+            return super().stored_image(index, camera)
 
     source = transformed(Ended(open_source(WORLD)), DataOptions(bad_image="repeat"))
     assert source.frame(2).index == 2

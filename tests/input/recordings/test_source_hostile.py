@@ -21,8 +21,8 @@ from gsstream.core.errors import SourceError
 from gsstream.input.prepare.raw import find_cameras
 from gsstream.input.recordings.clips import ImageClip
 from gsstream.input.recordings.images import read_image
-from gsstream.input.recordings.multiview import read_points
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
+from gsstream.input.recordings.pointfiles import read_points
 
 
 @pytest.fixture

@@ -15,9 +15,10 @@ import pytest
 from PIL import Image
 
 from gsstream.core.errors import SourceError
+from gsstream.input.recordings.base import Source
 from gsstream.input.recordings.images import shrink
-from gsstream.input.recordings.multiview import MultiviewSource, read_points
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
+from gsstream.input.recordings.pointfiles import read_points
 from gsstream.input.recordings.sync import RecordingWarning
 
 Edit = Callable[[dict[str, Any]], None]
@@ -44,6 +45,10 @@ def make_recording(folder: Path, *, frames: int = 2, size: tuple[int, int] = (12
     return folder
 
 
+def opened(folder: Path) -> Source:
+    return open_source(f"folder:{folder}")
+
+
 def edit_calibration(folder: Path, edit: Edit) -> None:
     path = folder / "cameras.json"
     data = json.loads(path.read_text())
@@ -52,7 +57,7 @@ def edit_calibration(folder: Path, edit: Edit) -> None:
 
 
 def test_pixels_splits_and_times_are_exact(tmp_path: Path) -> None:
-    source = MultiviewSource(make_recording(tmp_path / "r"))
+    source = opened(make_recording(tmp_path / "r"))
     assert source.info.train.ids == ("cam0", "cam1")
     assert source.info.test.ids == ("cam2",)
     frame = source.frame(1)
@@ -86,7 +91,7 @@ def test_sixteen_bit_colour_keeps_its_low_byte(tmp_path: Path) -> None:
     folder = make_recording(tmp_path / "r")
     pixels = np.random.default_rng(1).integers(0, 65536, (8, 12, 3)).astype(np.uint16)
     io.write_image_png_u16(str(folder / "cam0" / "0000.png"), pixels, "rgb")
-    np.testing.assert_allclose(MultiviewSource(folder).frame(0).images[0], pixels / 65535, atol=1e-7)
+    np.testing.assert_allclose(opened(folder).frame(0).images[0], pixels / 65535, atol=1e-7)
 
 
 def test_grey_images_of_both_depths(tmp_path: Path) -> None:
@@ -94,7 +99,7 @@ def test_grey_images_of_both_depths(tmp_path: Path) -> None:
     deep = np.random.default_rng(1).integers(0, 65536, (8, 12)).astype(np.uint16)
     Image.fromarray(deep).save(folder / "cam0" / "0000.png")
     Image.fromarray((deep >> 8).astype(np.uint8)).save(folder / "cam1" / "0000.png")
-    images = MultiviewSource(folder).frame(0).images
+    images = opened(folder).frame(0).images
     np.testing.assert_allclose(images[0], np.repeat(deep[..., None] / 65535, 3, 2), atol=1e-7)
     np.testing.assert_allclose(images[1], np.repeat((deep >> 8)[..., None] / 255, 3, 2), atol=1e-7)
 
@@ -155,18 +160,18 @@ def test_faulty_calibrations_are_explained(tmp_path: Path, fault: str) -> None:
     folder = make_recording(tmp_path / "r")
     edit_calibration(folder, edit)
     with pytest.raises(SourceError, match=message) as caught:
-        MultiviewSource(folder)
+        opened(folder)
     assert str(folder) in str(caught.value)
 
 
 def test_missing_folder_calibration_and_json(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no such folder"):
-        MultiviewSource(tmp_path / "absent")
+        opened(tmp_path / "absent")
     with pytest.raises(SourceError, match=r"cameras\.json: no such file"):
-        MultiviewSource(tmp_path)
+        opened(tmp_path)
     (tmp_path / "cameras.json").write_text('{"schema": ')
     with pytest.raises(SourceError, match="not valid JSON"):
-        MultiviewSource(tmp_path)
+        opened(tmp_path)
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
@@ -176,7 +181,7 @@ def test_truncated_images_are_named(tmp_path: Path, suffix: str, kept: float) ->
     path = folder / "cam1" / f"0001.{suffix}"
     data = path.read_bytes()
     path.write_bytes(data[: int(kept if kept >= 1 else kept * len(data))])
-    source = MultiviewSource(folder)
+    source = opened(folder)
     source.frame(0).validate()
     with pytest.raises(SourceError, match=rf"cam1.0001\.{suffix}: the image cannot be decoded"):
         source.frame(1)
@@ -184,10 +189,10 @@ def test_truncated_images_are_named(tmp_path: Path, suffix: str, kept: float) ->
 
 def test_wrong_size_transparency_and_late_loss_are_named(tmp_path: Path) -> None:
     folder = make_recording(tmp_path / "r")
-    source = MultiviewSource(folder)
+    source = opened(folder)
     path = folder / "cam0" / "0000.png"
     Image.new("RGB", (6, 4)).save(path)
-    with pytest.raises(SourceError, match=r"0000\.png: the image is 6 x 4 .* declares 12 x 8"):
+    with pytest.raises(SourceError, match=r"0000\.png: the image is 6 x 4 .* has 12 x 8"):
         source.frame(0)
     Image.new("RGBA", (12, 8)).save(path)
     with pytest.raises(SourceError, match="transparency"):
@@ -212,7 +217,6 @@ def test_points_that_float32_rounds_far_from_the_origin_are_named(tmp_path: Path
 
 def test_points_variants_and_faults(tmp_path: Path) -> None:
     source = open_source("demo")
-    assert isinstance(source, MultiviewSource)
     dense, sparse = source.points(), source.points("sparse")
     assert dense is not None
     assert sparse is not None
@@ -221,13 +225,13 @@ def test_points_variants_and_faults(tmp_path: Path) -> None:
     folder = make_recording(tmp_path / "r")
     np.savez(folder / "points_frame0.npz", xyz=np.zeros((2, 3)), rgb=np.zeros((2, 3), np.uint8))
     with pytest.raises(SourceError, match=r"no array 'sparse_xyz' .* it holds xyz, rgb"):
-        MultiviewSource(folder).points("sparse")
+        opened(folder).points("sparse")
     np.savez(folder / "points_frame0.npz", xyz=np.full((2, 3), np.nan), rgb=np.zeros((2, 3), np.uint8))
     with pytest.raises(SourceError, match="2 of 2 points are not finite"):
-        MultiviewSource(folder).points()
+        opened(folder).points()
     (folder / "points_frame0.npz").write_bytes(b"PK\x03\x04 broken")
     with pytest.raises(SourceError, match="cannot be read"):
-        MultiviewSource(folder).points()
+        opened(folder).points()
 
 
 def test_a_static_set_and_a_rig_without_test_cameras(tmp_path: Path) -> None:
@@ -239,7 +243,7 @@ def test_a_static_set_and_a_rig_without_test_cameras(tmp_path: Path) -> None:
             camera |= {"split": "train", "frames": f"cam{i}/0000.png"}
 
     edit_calibration(folder, static)
-    source = MultiviewSource(folder)
+    source = opened(folder)
     assert len(source.info.test) == 0
     source.frame(0).validate()
     source.frame(0, "test").validate()

@@ -13,12 +13,17 @@ import pytest
 from gsstream.core.errors import InputError, SourceError
 from gsstream.core.frame import Frame
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.base import SourceInfo, Split
+from gsstream.input.recordings.base import Source, SourceInfo, Split, assembled
+from gsstream.input.recordings.canonical import CanonicalSource, recording_similarity
+from gsstream.input.recordings.options import DataOptions
 from gsstream.input.recordings.prefetch import Prefetcher
 from gsstream.input.recordings.synthetic import SyntheticSource
+from gsstream.input.recordings.transformed import transformed
+
+SPLITS: tuple[Split, ...] = ("train", "test")
 
 
-class Watched:
+class Watched(Source):
     """A real source that records which frames were asked for, and fails at one of them."""
 
     def __init__(self, faulty: int | None = None) -> None:
@@ -36,9 +41,6 @@ class Watched:
         if index == self._faulty:
             raise SourceError(f"frame {index} is damaged")
         return self._source.frame(index, split)
-
-    def points(self) -> None:
-        return None
 
     def close(self) -> None:
         self._source.close()
@@ -109,37 +111,33 @@ def test_bounds_below_one_are_refused(depth: int, workers: int) -> None:
         Prefetcher(Watched(), range(3), depth=depth, workers=workers)
 
 
-class Singly:
+class Singly(Source):
     """A recording of 8 bits that counts how it is read; ``shift`` takes its last camera off the levels of bytes."""
 
     def __init__(self, shift: float = 0.0) -> None:
         self._inner, self.wholes, self.singles = SyntheticSource.from_query("frames=3&views=3&width=24&height=16"), 0, 0
-        self.info, self._shift = self._inner.info, shift
+        self._shift = shift
+
+    @property
+    def info(self) -> SourceInfo:
+        return self._inner.info
 
     def frame(self, index: int, split: Split = "train") -> Frame:
         self.wholes += split == "train"
-        frame = self._inner.frame(index, split)
-        images = np.rint(frame.images * 255).astype(np.float32) / np.float32(255)
-        if split == "train":
-            images[-1] += self._shift
-        return replace(frame, images=images)
+        return assembled(self, index, split).as_float32()
 
     def image(self, index: int, camera: str) -> FloatArray:
-        self.singles += 1
-        wholes = self.wholes
-        image: FloatArray = self.frame(index).images[self.info.train.ids.index(camera)]
-        self.wholes = wholes
-        return image
+        self.singles += camera in self.info.train.ids
+        shift = np.float32(self._shift if camera == self.info.train.ids[-1] else 0)
+        return self._inner.image(index, camera) + shift
 
-    def points(self, kind: str = "recording") -> None:
-        return None
-
-    def close(self) -> None: ...
+    def stored_frame(self, index: int, split: Split = "train") -> Frame:
+        return assembled(self, index, split)
 
 
-@pytest.mark.parametrize(("shift", "dtype", "wholes"), [(0.0, np.uint8, 0), (1e-3, np.float32, 3)])
-def test_bytes_are_read_camera_by_camera_and_other_images_whole(shift: float, dtype: type, wholes: int) -> None:
-    """Either way the frame is the one that the source gives."""
+@pytest.mark.parametrize(("shift", "dtype"), [(0.0, np.uint8), (1e-3, np.float32)])
+def test_images_wait_as_bytes_where_bytes_hold_all_of_them(shift: float, dtype: type) -> None:
+    """Either way the frame is the one that the source gives, and each image is read once."""
     source, plain = Singly(shift), Singly(shift)
     with Prefetcher(source, range(3), pack=True) as frames:
         for index, (train, test) in enumerate(frames):
@@ -148,23 +146,30 @@ def test_bytes_are_read_camera_by_camera_and_other_images_whole(shift: float, dt
             assert train.as_float32().images.tobytes() == want.images.tobytes()
             assert (train.index, train.timestamp, train.cameras.ids) == (index, want.timestamp, want.cameras.ids)
             assert test.as_float32().images.tobytes() == plain.frame(index, "test").images.tobytes()
-    assert (source.wholes, source.singles) == (wholes, 9)
+    assert (source.wholes, source.singles) == (0, 9)
 
 
 class Stored(Singly):
     """The same, of which the images can be read as the bytes that they are."""
 
-    def stored_image(self, index: int, camera: str) -> np.ndarray[Any, Any]:
+    def stored_image(self, index: int, camera: str) -> Any:
         return np.rint(Singly.image(self, index, camera) * 255).astype(np.uint8)
 
     def image(self, index: int, camera: str) -> FloatArray:
         raise AssertionError("read as float32, though its bytes are offered")
 
 
-def test_what_is_stored_as_bytes_is_never_float32() -> None:
-    source, plain = Stored(), Singly()
+def as_runs_open_it(source: Source, **options: Any) -> Source:
+    return CanonicalSource(transformed(source, DataOptions(**options)), recording_similarity(source))
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"test_cameras": ("cam00",)}, {"split": "tuning"}, {"train_views": 2}, {"bad_image": "drop"}]
+)
+def test_what_is_stored_as_bytes_is_never_float32_whatever_wraps_it(options: dict[str, Any]) -> None:
+    source, plain = as_runs_open_it(Stored(), **options), as_runs_open_it(Singly(), **options)
     with Prefetcher(source, range(3), pack=True) as frames:
-        for index, (train, _) in enumerate(frames):
-            assert train.images.dtype == np.uint8
-            assert train.as_float32().images.tobytes() == plain.frame(index).images.tobytes()
-    assert source.wholes == 0
+        for index, pair in enumerate(frames):
+            for frame, split in zip(pair, SPLITS, strict=True):
+                assert frame.images.dtype == np.uint8
+                assert frame.as_float32().images.tobytes() == plain.frame(index, split).images.tobytes()

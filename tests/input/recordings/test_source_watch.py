@@ -16,10 +16,9 @@ import pytest
 from gsstream.core.errors import EndOfRecording, SourceError
 from gsstream.core.frame import Arrival
 from gsstream.input.recordings import watch
-from gsstream.input.recordings.base import FrameSource, LiveSource
+from gsstream.input.recordings.base import Source
 from gsstream.input.recordings.disturbed import DisturbedSource
-from gsstream.input.recordings.images import read_image
-from gsstream.input.recordings.multiview import MultiviewSource
+from gsstream.input.recordings.images import read_stored
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
 from gsstream.input.recordings.options import Disturbances
 from gsstream.input.recordings.prefetch import Prefetcher
@@ -32,18 +31,17 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "live"
 
 
-def disturbed(live: FrameSource, **disturbances: Any) -> DisturbedSource:
+def disturbed(live: Source, **disturbances: Any) -> DisturbedSource:
     return DisturbedSource(live, Disturbances(**disturbances), 0, live.info.uri)
 
 
 @pytest.fixture
 def test_camera() -> str:
-    return MultiviewSource(DEMO_FOLDER).info.test.ids[0]
+    return open_source("demo").info.test.ids[0]
 
 
 def test_it_reads_what_the_folder_reader_reads(folder: Path) -> None:
     live, finished = open_source(f"watch:{folder}", 0.5), open_source(str(folder), 0.5)
-    assert isinstance(live, LiveSource)
     assert live.info.uri == finished.info.uri
     for split in ("train", "test"):
         assert np.array_equal(live.frame(3, split).images, finished.frame(3, split).images)
@@ -139,9 +137,9 @@ def test_an_image_that_comes_during_a_look_is_not_given_up(folder: Path, monkeyp
             for one in late:
                 if not one.exists():
                     one.with_suffix(".part").rename(one)
-        return read_image(path, *size)
+        return read_stored(path, *size)
 
-    monkeypatch.setattr(watch, "read_image", slow)
+    monkeypatch.setattr(watch, "read_stored", slow)
     arrival = live.frame(1).arrival
     assert arrival is not None
     assert arrival.absent == ()

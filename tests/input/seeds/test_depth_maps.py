@@ -21,8 +21,8 @@ from gsstream.encode import to_rig_coordinates
 from gsstream.engine.fit import constants
 from gsstream.engine.frame0.points import gather_points
 from gsstream.input.recordings.depth_maps import read_depth_maps
-from gsstream.input.recordings.multiview import read_points
 from gsstream.input.recordings.open import open_source
+from gsstream.input.recordings.pointfiles import read_points
 from gsstream.input.recordings.primitives import cast
 from gsstream.input.recordings.synthetic import SyntheticSource
 from gsstream.input.seeds import sfm

@@ -72,7 +72,7 @@ def read(folder: Path) -> Recording:
         clips=clips,
         lenses=lenses,
         sizes=sizes,
-        points=lambda: _points(model, numbers),
+        points=lambda _: _points(model, numbers),
     )
 
 

@@ -1,7 +1,4 @@
-"""A folder with cameras.json as a rig of clips: videos, lenses that distort, and for ``prepare`` pictures of any size.
-
-Pinhole images of one size need none of it; :class:`~gsstream.input.recordings.multiview.MultiviewSource` reads them.
-"""
+"""A folder with cameras.json (schema "opencv-multiview-1"): its images or videos, and optional points_frame0.npz."""
 
 from __future__ import annotations
 
@@ -9,10 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
+from gsstream.core.errors import SourceError
+from gsstream.input.recordings.base import FilesMissing, PointKind
 from gsstream.input.recordings.calibration import CALIBRATION_FILE, Calibration, frame_path, is_video, read_calibration
 from gsstream.input.recordings.clips import Clip, ImageClip
-from gsstream.input.recordings.multiview import POINTS_FILE, check_files, read_points
+from gsstream.input.recordings.pointfiles import POINTS_FILE, read_points
 from gsstream.input.recordings.recorded import Recording, SeenPoints
+
+
+def looks_like(folder: Path) -> bool:
+    """Say whether there is a cameras.json, which counts whatever else the folder holds."""
+    return (folder / CALIBRATION_FILE).is_file()
 
 
 def read(folder: Path, *, any_sizes: bool = False) -> Recording:
@@ -33,7 +37,7 @@ def read(folder: Path, *, any_sizes: bool = False) -> Recording:
         fps=known.fps,
         lenses=known.lenses,
         sizes=known.sizes,
-        points=lambda: _points(folder, known),
+        points=lambda kind: _points(folder, known, kind),
         licence=known.licence,
     )
 
@@ -47,12 +51,51 @@ def _clip(folder: Path, known: Calibration, name: str) -> Clip:
     return VideoClip(folder / pattern, known.num_frames or None)
 
 
-def _points(folder: Path, known: Calibration) -> SeenPoints | None:
+def _points(folder: Path, known: Calibration, kind: PointKind) -> SeenPoints | None:
     """The points that ship. Every training camera counts as having taken part, since the file does not say which."""
     path = folder / POINTS_FILE
     if not path.exists():
         return None
-    cloud = read_points(path, "recording")
-    return SeenPoints(
-        cloud, np.tile([*(True for _ in known.train.ids), *(False for _ in known.test.ids)], (len(cloud), 1))
-    )
+    cloud, taking_part = read_points(path, kind), [True] * len(known.train) + [False] * len(known.test)
+    return SeenPoints(cloud, np.broadcast_to(taking_part, (len(cloud), len(taking_part))))
+
+
+def check_files(folder: Path, calibration: Calibration) -> None:
+    """Raise SourceError for what is declared and is not there, before anything is trained on what is."""
+    for camera_id in (*calibration.train.ids, *calibration.test.ids):
+        pattern = calibration.patterns[camera_id]
+        if is_video(pattern):
+            if not (folder / pattern).is_file():
+                raise FilesMissing(f"{folder}: camera {camera_id!r} has no video; expected {folder / pattern}")
+            continue
+        if "%" not in pattern and calibration.num_frames > 1:
+            raise SourceError(
+                f"{folder}: camera {camera_id!r}: {calibration.num_frames} frames are declared, but 'frames' "
+                f"{pattern!r} names a single image; use a pattern such as %06d, or name a video"
+            )
+        _check_images(folder, camera_id, pattern, calibration.num_frames)
+
+
+def _check_images(folder: Path, camera_id: str, pattern: str, count: int) -> None:
+    _check_span(folder, camera_id, pattern, count)
+    paths = [folder / frame_path(pattern, t) for t in range(count)]
+    missing = [p for p in paths if not p.is_file()]
+    if len(missing) == len(paths):
+        raise FilesMissing(f"{folder}: camera {camera_id!r} has no frames; expected {missing[0]} and its followers")
+    if missing:
+        raise FilesMissing(
+            f"{folder}: camera {camera_id!r}: {len(missing)} of {len(paths)} frames are missing, the first is "
+            f'{missing[0]}; restore them or lower "frames" in cameras.json'
+        )
+
+
+def _check_span(folder: Path, camera_id: str, pattern: str, count: int) -> None:
+    """The first and the last image first: a count of millions is answered at once, without a list of names."""
+    for index in (0, count - 1):
+        path = folder / frame_path(pattern, index)
+        try:
+            there = path.is_file()
+        except OSError as error:
+            raise SourceError(f"{folder}: camera {camera_id!r}: {str(path)[:100]}...: {error.strerror}") from error
+        if not there and count > 100_000:
+            raise FilesMissing(f"{folder}: camera {camera_id!r}: {count} frames are declared, but {path} is missing")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsstream.input.recordings.base import PointKind
 from gsstream.input.recordings.layouts.llff import looks_like_llff, read_llff
 from gsstream.input.recordings.pointfiles import read_ply_points
 from gsstream.input.recordings.recorded import Recording, SeenPoints
@@ -25,7 +26,7 @@ def read(folder: Path) -> Recording:
     """Read N3DV: 18 to 21 cameras, 2704 x 2028, 30 frames per second; cam00 is for tests (paper and released code)."""
     recording = read_llff(folder, PATTERN)
 
-    def points() -> SeenPoints | None:
+    def points(_: PointKind) -> SeenPoints | None:
         found = [folder / name for name in POINTS_FILES if (folder / name).is_file()]
         if not found:
             return None

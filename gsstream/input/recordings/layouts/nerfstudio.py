@@ -80,7 +80,7 @@ def read(folder: Path, missing: Missing = "skip") -> Recording:
         fps=float(data.get("fps", 30.0)),
         lenses=lenses,
         sizes=sizes,
-        points=lambda: _points(folder, data, len(names)),
+        points=lambda _: _points(folder, data, len(names)),
     )
 
 

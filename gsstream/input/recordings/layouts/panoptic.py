@@ -60,7 +60,7 @@ def read(folder: Path) -> Recording:
         rig=rig,
         clips=clips,
         test=test,
-        points=lambda: _points(folder / POINTS, len(ids)),
+        points=lambda _: _points(folder / POINTS, len(ids)),
         licence="CMU Panoptic: research use only",
     )
 

@@ -16,7 +16,7 @@ from gsstream.core.projection import inside, project
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.core.storage import unpacked
 from gsstream.engine.run.displacement import screen_displacement
-from gsstream.input.recordings.base import FrameSource
+from gsstream.input.recordings.base import Source
 from gsstream.metrics.moving import changed_mask, dilate
 from gsstream.packet import PacketKind, PlayerState, StreamReader, decode_packet
 
@@ -31,7 +31,7 @@ LEAST_CAMERAS = 2
 MOST = 0.75
 
 
-def left_behind(stream: Path, source: FrameSource) -> Iterator[tuple[int, dict[str, int]]]:
+def left_behind(stream: Path, source: Source) -> Iterator[tuple[int, dict[str, int]]]:
     """Yield (frame, counts) of every frame of a stream; the counts begin anew at each key packet."""
     found, state = LeftBehind(), None
     with StreamReader(stream) as reader:

@@ -17,7 +17,7 @@ from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.budget.memory import limit_memory
 from gsstream.engine.run.encoder import Callbacks, Encoder
 from gsstream.engine.run.output import write_whole
-from gsstream.input.recordings.base import FrameSource, SourceInfo, check_index
+from gsstream.input.recordings.base import Source, SourceInfo, check_index
 from gsstream.packet import EncodedPacket, StreamMeta, StreamWriter
 from gsstream.recipe.model import LATER_KEYS, Recipe
 
@@ -43,16 +43,16 @@ class FreshFrames:
     """The fresh reconstructions of one recording by one recipe, one stream file of a single packet for each frame."""
 
     assembly: Assembly  # assembled from :func:`fresh_recipe`
-    source: FrameSource  # the recording as the run opened it
+    source: Source  # the recording as the run opened it
     cache: Path  # folder that keeps them; several runs may share one, because a file's name says what it was made of
 
     @classmethod
     def of_run(
-        cls, recipe: Recipe, source: FrameSource, cache: Path, catalog: Catalog, epochs: int | None = None
+        cls, recipe: Recipe, source: Source, cache: Path, catalog: Catalog, epochs: int | None = None
     ) -> FreshFrames:
         """Return those of a run by its recipe."""
         assembly = assemble(fresh_recipe(recipe, epochs), catalog)
-        return cls(limit_memory(assembly, source.info), source, cache)
+        return cls(limit_memory(assembly, source), source, cache)
 
     @property
     def epochs(self) -> int:

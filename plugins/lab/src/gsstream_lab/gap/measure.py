@@ -16,7 +16,7 @@ from gsstream.core.shapes import FloatArray
 from gsstream.evaluation.records import finite_or_none, mean
 from gsstream.evaluation.seen import seen_masks
 from gsstream.evaluation.summary import format_table
-from gsstream.input.recordings.base import FrameSource
+from gsstream.input.recordings.base import Source
 from gsstream.metrics import changed_mask, moving_mask, noise_sigma, psnr
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, find_renderer, render
@@ -103,7 +103,7 @@ class Gap:
 def measure_gap(
     stream: Path,
     fresh: Mapping[int, Path],
-    source: FrameSource,
+    source: Source,
     epochs: int,
     *,
     renderer: PlayerRenderer | None = None,

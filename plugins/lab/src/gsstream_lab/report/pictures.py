@@ -18,7 +18,7 @@ from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.run.recording import reopen_recording
 from gsstream.evaluation.contact_sheet import most_changed_window, sheet_of_stream
 from gsstream.evaluation.evaluate import StreamFrames
-from gsstream.input.recordings.base import FrameSource
+from gsstream.input.recordings.base import Source
 from gsstream.metrics import changed_mask, psnr
 from gsstream.player.play import write_pictures
 from gsstream.player.playback import Playback
@@ -63,7 +63,7 @@ def tiles_in_rows(rows: Sequence[Sequence[Tile]]) -> Bytes:
 class SideBySide:
     """Streams of one recording, seen from its first test camera."""
 
-    def __init__(self, streams: Mapping[str, Path], source: FrameSource) -> None:
+    def __init__(self, streams: Mapping[str, Path], source: Source) -> None:
         self._stack = ExitStack()
         renderer = find_renderer()
         self.shown: dict[str, StreamFrames] = {}
@@ -123,7 +123,7 @@ class SideBySide:
 
 
 @contextmanager
-def recording_of(data: SweepData, scene: str, recordings: Path | None) -> Iterator[FrameSource]:
+def recording_of(data: SweepData, scene: str, recordings: Path | None) -> Iterator[Source]:
     """Open the recording of a scene as its first run saw it. Raises InputError where it cannot be found."""
     group = data.of(scene)[0]
     run = group.runs[0]
@@ -137,7 +137,7 @@ def recording_of(data: SweepData, scene: str, recordings: Path | None) -> Iterat
         source.close()
 
 
-def contact_sheet(folder: Path, data: SweepData, scene: str, source: FrameSource) -> list[Block]:
+def contact_sheet(folder: Path, data: SweepData, scene: str, source: Source) -> list[Block]:
     """Return the contact sheet of the first run of a scene: what it shows, its errors, what was allowed to change."""
     group = data.of(scene)[0]
     run = group.runs[0]
@@ -148,7 +148,7 @@ def contact_sheet(folder: Path, data: SweepData, scene: str, source: FrameSource
     return [f"### {scene}: pictures", Picture(f"{scene}-sheet.jpg", sheet, text)]
 
 
-def side_by_side(folder: Path, data: SweepData, scene: str, source: FrameSource) -> list[Block]:
+def side_by_side(folder: Path, data: SweepData, scene: str, source: Source) -> list[Block]:
     """Return a sheet and a video of the first seed of every group, seen from the first test camera."""
     streams = {group.label: cell_file(folder, group.runs[0].id) for group in data.of(scene)}
     with tempfile.TemporaryDirectory() as temporary, SideBySide(streams, source) as together:

@@ -21,7 +21,7 @@ from gsstream_lab.sweep.config import Measure
 if TYPE_CHECKING:
     from gsstream.engine.assembly.assemble import Assembly
     from gsstream.evaluation.evaluate import Evaluation
-    from gsstream.input.recordings.base import FrameSource
+    from gsstream.input.recordings.base import Source
 
 #: Fields of a record that say which view it is about; all others are numbers, extra metrics included.
 _PLACE = ("frame", "camera", "extra")
@@ -112,7 +112,7 @@ def _run(job: Job, folder: Path) -> Outcome:
     )
 
 
-def _measure(measure: Measure, stream: Path, recording: FrameSource, frames: list[dict[str, Any]]) -> dict[str, Any]:
+def _measure(measure: Measure, stream: Path, recording: Source, frames: list[dict[str, Any]]) -> dict[str, Any]:
     """Measure decoded frames; their values go into ``frames``. Returns facts about the whole stream."""
     from gsstream.evaluation.evaluate import evaluate
     from gsstream.metrics import SSIM_VARIANT, OnnxLpips

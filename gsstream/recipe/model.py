@@ -212,7 +212,7 @@ class Recipe(Section):
     loss: Loss = Field(default=Loss(), description="photometric loss")
     codec: Codec = Field(default=Codec(), description="packets")
     budget: Budget = Field(default=Budget(), description="what a frame may cost; nothing given: no limits")
-    data: DataOptions = Field(default=DataOptions(), description="the split, and disturbances for experiments")
+    data: DataOptions = Field(default=DataOptions(), description="the split, and what is done about bad images")
     background: Literal["auto"] | tuple[Channel, Channel, Channel] = Field(
         default="auto",
         description="colour behind everything, red, green, blue from 0 to 1; auto: the mean of the training images of "

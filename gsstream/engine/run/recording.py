@@ -51,7 +51,7 @@ def reopen_recording(uri: str, recipe: Mapping[str, Any], catalog: Catalog) -> S
 
 
 def _open(uri: str, scale: float, data: DataOptions, catalog: Catalog) -> Source:
-    source = _open_plain(uri, scale, catalog)
+    source = open_plain(uri, scale, catalog)
     try:
         return CanonicalSource(transformed(source, data), recording_similarity(source))
     except BaseException:
@@ -59,8 +59,8 @@ def _open(uri: str, scale: float, data: DataOptions, catalog: Catalog) -> Source
         raise
 
 
-def _open_plain(uri: str, scale: float, catalog: Catalog) -> Source:
-    """A source part of a plugin when the scheme names one, else one of the built-in sources."""
+def open_plain(uri: str, scale: float, catalog: Catalog) -> Source:
+    """Open ``uri`` as it is, in the coordinates of its files: by a plugin's source when the scheme names one."""
     scheme = uri.partition(":")[0]
     entry = catalog.entries.get(("source", scheme))
     if entry is None or entry.plugin == "builtin":

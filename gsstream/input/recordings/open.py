@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gsstream.core.errors import SourceError
+from gsstream.core.install_hints import install_part
 from gsstream.input.recordings.base import Source
 from gsstream.input.recordings.clips import prepare_command
 from gsstream.input.recordings.recorded import RecordedSource, Recording
@@ -28,7 +29,6 @@ _KNOWN = (
     "'demo' (a small recording inside the package), "
     "'synthetic:' with options such as 'synthetic:frames=40&views=8' (an analytic scene of any length), "
     "'watch:DIR' (a folder that is still being written), "
-    "'disturbed:KEY=VALUE,...:' before any of them (an experiment), "
     f"or the path of a folder, read by its layout or as you say: {':DIR, '.join(LAYOUTS)}:DIR"
 )
 
@@ -46,32 +46,16 @@ def open_source(uri: str, scale: float = 1.0) -> Source:
         from gsstream.input.recordings.watch import WatchSource
 
         return WatchSource.from_query(rest, scale=scale)
-    if separator and scheme == "disturbed":
-        return _disturbed(rest, scale, uri)
     named = scheme if separator and scheme in LAYOUTS else None
     folder = Path(rest if named else uri)
     # Path takes an empty text for the current folder, which is never what was meant.
     if not (uri and _exists(folder)) and not named:
+        if separator and (command := install_part("source", scheme)):
+            raise SourceError(f"source {uri[:200]!r}: the source {scheme!r} comes with another distribution: {command}")
         raise SourceError(f"source {uri[:200]!r}: no such folder and no known scheme; expected {_KNOWN}")
     if named == "nerfstudio" and not _exists(folder):
         return _nerfstudio(rest, scale, uri)
     return RecordedSource(read_layout(named or detect(folder), folder), scale=scale, uri=uri)
-
-
-def _disturbed(rest: str, scale: float, uri: str) -> Source:
-    """``disturbed:KEY=VALUE,...:URI``. Raises SourceError for an unknown key, and what opening URI raises."""
-    from gsstream.input.recordings.disturbed import DisturbedSource, parse_disturbances
-
-    text, colon, inner = rest.partition(":")
-    if not colon:
-        raise SourceError(f"source {uri[:200]!r}: expected disturbed:KEY=VALUE,...:URI, e.g. disturbed:gain=0.8:demo")
-    options, seed = parse_disturbances(text)
-    source = open_source(inner, scale)
-    try:
-        return DisturbedSource(source, options, seed, uri)
-    except SourceError:
-        source.close()
-        raise
 
 
 def _nerfstudio(rest: str, scale: float, uri: str) -> Source:

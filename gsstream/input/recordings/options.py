@@ -13,44 +13,8 @@ from gsstream.core.errors import SourceError, suggest
 Options = TypeVar("Options", bound=BaseModel)
 
 Leak = Literal["none", "points", "training"]
-LostImage = Literal["hold", "black"]
 SplitName = Literal["reporting", "tuning"]
 BadImage = Literal["stop", "repeat", "drop"]
-
-
-class Disturbances(BaseModel):
-    """What an experiment does to a recording on purpose; the options of ``disturbed:KEY=VALUE,...:URI``."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
-
-    gain: float = Field(default=1.0, gt=0, le=4, description="factor on all images, clipped to [0, 1]")
-    gain_amplitude: float = Field(
-        default=0.0, ge=0, lt=1, description="the factor of frame t lies in gain * (1 -/+ this) (paper: 0.2 to 0.5)"
-    )
-    gain_pattern: Literal["sine", "random"] = Field(
-        default="sine", description="sine: smooth, frame 0 has factor gain; random: uniform, anew in every frame"
-    )
-    gain_period: float = Field(default=60.0, gt=0, description="frames per period of the sine")
-    noise_sigma: float = Field(
-        default=0.0, ge=0, le=255, description="noise on training images, 8-bit levels, clipped to [0, 1] (paper: 0-30)"
-    )
-    noise_frames: int = Field(default=1, ge=1, description="the first so many frames are noisy (paper: frame 0 alone)")
-    lost_cameras: tuple[str, ...] = Field(
-        default=(), description="ID@A-B+...: this training camera gives nothing in frames A to B - 1, e.g. c3@10-20"
-    )
-    lost_share: float = Field(
-        default=0.0, ge=0, lt=1, description="each training image after frame 0 is lost with this probability"
-    )
-    lost_as: LostImage = Field(
-        default="hold", description="a lost image is: hold: the camera's last one; black: a black one"
-    )
-    time_offset: tuple[str, ...] = Field(
-        default=(), description="ID@FRAMES+...: a camera's frame t + FRAMES stands for frame t, e.g. c3@2+c5@-1"
-    )
-
-
-#: Nothing is done to a recording.
-UNDISTURBED = Disturbances()
 
 
 class DataOptions(BaseModel):

@@ -1,12 +1,7 @@
-"""Pure functions that transform a recording before a run: camera splits, time shifts, gain, noise, lost images.
-
-Everything is decided by the options and a seed. With the defaults nothing is touched.
-"""
+"""Which cameras train and which test, by the options of a recipe."""
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -14,44 +9,12 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
-from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.options import DataOptions, Disturbances
+from gsstream.input.recordings.options import DataOptions
 
 
-def parse_offsets(entries: Sequence[str], ids: Sequence[str]) -> dict[str, int]:
-    """Return camera -> frames, from "ID@FRAMES". Raises SourceError naming the entry."""
-    found: dict[str, int] = {}
-    for entry in entries:
-        name, _, value = entry.rpartition("@")
-        if not re.fullmatch(r"-?\d{1,9}", value):
-            raise SourceError(
-                f"disturbed source: time_offset: expected ID@FRAMES+..., whole frames, e.g. cam03@2, got {entry!r}"
-            )
-        found[_known("disturbed source: time_offset", name, ids, found)] = int(value)
-    return found
-
-
-def parse_losses(entries: Sequence[str], ids: Sequence[str]) -> dict[str, list[range]]:
-    """Return camera -> frames in which it gives nothing, from "ID@A-B".
-
-    Frame 0 cannot be lost: it is the key picture.
-    """
-    found: dict[str, list[range]] = {}
-    for entry in entries:
-        name, _, value = entry.rpartition("@")
-        match = re.fullmatch(r"(\d{1,9})-(\d{1,9})", value)
-        first, last = (int(n) for n in match.groups()) if match else (0, 0)
-        if not 1 <= first < last:
-            raise SourceError(
-                f"disturbed source: lost_cameras: expected ID@A-B with 1 <= A < B, e.g. cam03@10-20, got {entry!r}; "
-                "frame 0 needs every training camera (leave one out with data.train_cameras)"
-            )
-        found.setdefault(_known("disturbed source: lost_cameras", name, ids, ()), []).append(range(first, last))
-    return found
-
-
-def _known(key: str, name: str, ids: Sequence[str], taken: Sequence[str] | dict[str, int]) -> str:
+def known_camera(key: str, name: str, ids: Sequence[str], taken: Sequence[str] | dict[str, int]) -> str:
+    """Return the name of a camera. Raises SourceError, naming the option, for one that is unknown or given before."""
     if name not in ids:
         raise SourceError(f"{key}: no camera {name!r}; cameras: {', '.join(ids)}")
     if name in taken:
@@ -137,7 +100,7 @@ def _medoids(centers: FloatArray, count: int) -> list[int]:
 
 def _named(key: str, wanted: tuple[str, ...], ids: tuple[str, ...]) -> tuple[str, ...]:
     for position, name in enumerate(wanted):
-        _known(key, name, ids, wanted[:position])
+        known_camera(key, name, ids, wanted[:position])
     return wanted
 
 
@@ -157,36 +120,3 @@ def _far_apart(names: tuple[str, ...], count: int, train: Cameras, test: Cameras
 def _centers(names: tuple[str, ...], train: Cameras, test: Cameras) -> FloatArray:
     places = dict(zip((*train.ids, *test.ids), np.concatenate([train.centers, test.centers]), strict=True))
     return np.array([places[name] for name in names]).reshape(-1, 3)
-
-
-def gain_at(options: Disturbances, index: int, rng: Rng) -> float:
-    """Return the factor on all images of frame ``index``, in gain * [1 - amplitude, 1 + amplitude]."""
-    if options.gain_pattern == "sine":
-        wave = math.sin(2 * math.pi * index / options.gain_period)
-    else:
-        wave = float(rng.numpy("data gain", index).uniform(-1, 1))
-    return options.gain * (1 + options.gain_amplitude * wave)
-
-
-def with_gain(image: FloatArray, factor: float) -> FloatArray:
-    """Return the image times a factor; what exceeds 1 saturates, as in a camera."""
-    if factor == 1:
-        return image
-    out: FloatArray = np.minimum(image * np.float32(factor), np.float32(1))
-    return out
-
-
-def with_noise(image: FloatArray, sigma: float, camera: str, index: int, rng: Rng) -> FloatArray:
-    """Return the image with Gaussian noise of ``sigma`` 8-bit levels, clipped to [0, 1] (paper, first-frame noise)."""
-    noise = rng.numpy(f"data noise {camera}", index).standard_normal(image.shape, np.float32)
-    out: FloatArray = np.clip(image + noise * np.float32(sigma / 255), 0, 1)
-    return out
-
-
-def is_lost(options: Disturbances, losses: dict[str, list[range]], camera: str, index: int, rng: Rng) -> bool:
-    """Say whether a training camera gives nothing at a frame; never at frame 0."""
-    if index == 0:
-        return False
-    if any(index in frames for frames in losses.get(camera, ())):
-        return True
-    return options.lost_share > 0 and bool(rng.numpy(f"data loss {camera}", index).random() < options.lost_share)

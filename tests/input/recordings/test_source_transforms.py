@@ -1,9 +1,8 @@
-"""Splits, clocks, light, noise and losses: what the options say happens, exactly and repeatably, and nothing else."""
+"""Splits: what the options say happens, exactly and repeatably, and nothing else."""
 
 from __future__ import annotations
 
 import itertools
-import math
 from typing import Any
 
 import numpy as np
@@ -12,15 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsstream.core.errors import RecipeError, SourceError
-from gsstream.core.rng import Rng
 from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.run.recording import reopen_recording
-from gsstream.input.recordings.disturbed import DisturbedSource
 from gsstream.input.recordings.open import open_source
-from gsstream.input.recordings.options import DataOptions, Disturbances
+from gsstream.input.recordings.options import DataOptions
 from gsstream.input.recordings.synthetic import SyntheticSource
 from gsstream.input.recordings.transformed import transformed
-from gsstream.input.recordings.transforms import gain_at
 from gsstream.recipe.load import resolve_recipe
 
 WORLD = "synthetic:frames=12&views=4&width=16&height=12&supersample=1&motion=3"
@@ -30,30 +26,9 @@ def opened(uri: str = WORLD, **options: Any):
     return transformed(open_source(uri), DataOptions(**options))
 
 
-def disturbed(uri: str = WORLD, seed: int = 0, **options: Any):
-    return DisturbedSource(open_source(uri), Disturbances(**options), seed, uri)
-
-
 def test_defaults_are_the_source_itself() -> None:
     source = open_source(WORLD)
     assert transformed(source, DataOptions()) is source
-
-
-@pytest.mark.parametrize("uri", [WORLD, "demo"])
-def test_a_change_that_touches_no_frame_leaves_every_bit(uri: str) -> None:
-    """A loss far behind the end: the wrapper is there and must be invisible."""
-    plain = open_source(uri)
-    wrapped = disturbed(uri, lost_cameras=(f"{plain.info.train.ids[1]}@900-901",))
-    assert wrapped is not plain
-    for index in (0, 7):
-        for split in ("train", "test"):
-            theirs, ours = plain.frame(index, split), wrapped.frame(index, split)
-            assert ours.cameras.ids == theirs.cameras.ids
-            assert ours.images.tobytes() == theirs.images.tobytes()
-            assert ours.timestamp == theirs.timestamp
-    cloud = wrapped.points()
-    assert cloud is not None
-    assert cloud.xyz.tobytes() == plain.points().xyz.tobytes()
 
 
 def test_a_test_camera_leaves_training_and_takes_its_points_along() -> None:
@@ -139,82 +114,6 @@ def test_fewer_views_are_subsets_of_more(count: int) -> None:
     assert list(chosen(count)) == sorted(chosen(count), key=ids.index)
 
 
-@given(st.lists(st.integers(-3, 3), min_size=5, max_size=5))
-@settings(max_examples=20, deadline=None)
-def test_clocks_are_shifted_and_no_frame_is_shown_twice(offsets: list[int]) -> None:
-    plain = open_source(WORLD)
-    ids = (*plain.info.train.ids, *plain.info.test.ids)
-    source = disturbed(time_offset=tuple(f"{i}@{o}" for i, o in zip(ids, offsets, strict=True)))
-    start = max(0, -min(offsets))
-    assert source.info.num_frames == 12 - max(0, -min(offsets)) - max(0, max(offsets))
-    for index in (0, source.info.num_frames - 1):
-        frame = source.frame(index)
-        assert frame.index == index
-        for row, offset in enumerate(offsets[:-1]):
-            np.testing.assert_array_equal(frame.images[row], plain.frame(start + index + offset).images[row])
-    with pytest.raises(SourceError, match="has no frame"):
-        source.frame(source.info.num_frames)
-
-
-@given(
-    st.sampled_from(["sine", "random"]), st.floats(0.2, 2), st.floats(0, 0.9), st.integers(0, 400), st.integers(0, 9)
-)
-@settings(max_examples=60, deadline=None)
-def test_gain_stays_in_its_range(pattern: Any, gain: float, amplitude: float, index: int, seed: int) -> None:
-    options = Disturbances(gain=gain, gain_amplitude=amplitude, gain_pattern=pattern)
-    value = gain_at(options, index, Rng(seed))
-    assert gain * (1 - amplitude) - 1e-9 <= value <= gain * (1 + amplitude) + 1e-9
-    if pattern == "sine" and index % 60 == 0:
-        assert value == pytest.approx(gain)
-    if pattern == "sine" and index % 60 == 15:
-        assert value == pytest.approx(gain * (1 + amplitude))
-
-
-def test_gain_touches_test_cameras_and_saturates() -> None:
-    plain, source = open_source(WORLD), disturbed(gain=3.0)
-    for split in ("train", "test"):
-        truth = np.minimum(plain.frame(4, split).images * np.float32(3), 1)
-        np.testing.assert_array_equal(source.frame(4, split).images, truth)
-        assert truth.max() == 1
-
-
-def test_noise_has_its_sigma_hits_training_images_of_the_first_frames_and_follows_the_seed() -> None:
-    plain = open_source(WORLD.replace("width=16&height=12", "width=96&height=72"))
-    source = DisturbedSource(plain, Disturbances(noise_sigma=10, noise_frames=2), 5, WORLD)
-    for index in (0, 1):
-        before, after = plain.frame(index).images, source.frame(index).images
-        inside = (before > 0.2) & (before < 0.8)
-        assert (after - before)[inside].std() * 255 == pytest.approx(10, rel=0.02)
-        assert abs((after - before)[inside].mean()) * 255 < 0.2
-        assert 0 <= after.min() <= after.max() <= 1
-    assert source.frame(2).images.tobytes() == plain.frame(2).images.tobytes()
-    assert source.frame(0, "test").images.tobytes() == plain.frame(0, "test").images.tobytes()
-    again, other = (
-        DisturbedSource(plain, Disturbances(noise_sigma=10), seed, WORLD).frame(0).images for seed in (5, 6)
-    )
-    assert again.tobytes() == source.frame(0).images.tobytes() != other.tobytes()
-
-
-def test_lost_images_hold_the_last_one_or_are_black() -> None:
-    plain = open_source(WORLD)
-    name = plain.info.train.ids[2]
-    hold = disturbed(lost_cameras=(f"{name}@3-6", f"{name}@8-9"))
-    black = disturbed(lost_cameras=(f"{name}@3-6",), lost_as="black")
-    for index in range(10):
-        shown = 2 if 3 <= index < 6 else 7 if index == 8 else index
-        np.testing.assert_array_equal(hold.frame(index).images[2], plain.frame(shown).images[2])
-        np.testing.assert_array_equal(hold.frame(index).images[[0, 1, 3]], plain.frame(index).images[[0, 1, 3]])
-        assert (black.frame(index).images[2].max() == 0) == (3 <= index < 6)
-
-
-def test_random_losses_have_their_share_and_spare_frame_0_and_the_test_camera() -> None:
-    source = disturbed(WORLD.replace("frames=12", "frames=200"), lost_share=0.3, lost_as="black")
-    lost = np.array([source.frame(i).images.max(axis=(1, 2, 3)) == 0 for i in range(200)])
-    assert not lost[0].any()
-    assert abs(lost[1:].mean() - 0.3) < 4 * math.sqrt(0.21 / lost[1:].size)
-    assert source.frame(5, "test").images.max() > 0
-
-
 FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "ghost test": ({"test_cameras": ("cam9",)}, "data.test_cameras: no camera 'cam9'; cameras: cam"),
     "ghost train": ({"train_cameras": ("cam9",)}, "data.train_cameras: no camera 'cam9'"),
@@ -252,9 +151,3 @@ def test_options_are_recipe_keys_with_provenance_and_travel_with_the_stream() ->
     assert again.frame(0).images.tobytes() == opened(train_views=2).frame(0).images.tobytes()
     with pytest.raises(RecipeError, match=r"data\.fog.*of another version of gsstream"):
         reopen_recording(WORLD, {"data": {"fog": 1}}, catalog)
-
-
-def test_a_test_camera_is_not_lost() -> None:
-    test = open_source(WORLD).info.test.ids[0]
-    with pytest.raises(SourceError, match="lost_cameras: no camera"):
-        disturbed(lost_cameras=(f"{test}@1-5",))

@@ -17,11 +17,11 @@ from gsstream.core.errors import EndOfRecording, SourceError
 from gsstream.core.frame import Arrival
 from gsstream.input.recordings import watch
 from gsstream.input.recordings.base import Source
-from gsstream.input.recordings.disturbed import DisturbedSource
 from gsstream.input.recordings.images import read_stored
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
-from gsstream.input.recordings.options import Disturbances
+from gsstream.input.recordings.options import DataOptions
 from gsstream.input.recordings.prefetch import Prefetcher
+from gsstream.input.recordings.transformed import transformed
 
 
 @pytest.fixture
@@ -31,8 +31,9 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "live"
 
 
-def disturbed(live: Source, **disturbances: Any) -> DisturbedSource:
-    return DisturbedSource(live, Disturbances(**disturbances), 0, live.info.uri)
+def through(live: Source) -> Source:
+    """The same under options of a run that change nothing of it."""
+    return transformed(live, DataOptions(bad_image="repeat"))
 
 
 @pytest.fixture
@@ -54,14 +55,14 @@ def test_an_absent_test_camera_is_not_measured(folder: Path, test_camera: str) -
     live = open_source(f"watch:{folder}?missing=hold&grace=0", 0.25)
     assert [len(live.frame(t, "test").cameras) for t in range(3)] == [1, 0, 1]
     assert live.frame(1).epoch_scale == 1
-    through = disturbed(live, gain=0.5)
-    assert [len(through.frame(t, "test").cameras) for t in range(3)] == [1, 0, 1]
-    assert np.array_equal(through.frame(1).images, np.float32(0.5) * live.frame(1).images)
+    split = through(live)
+    assert [len(split.frame(t, "test").cameras) for t in range(3)] == [1, 0, 1]
+    assert np.array_equal(split.frame(1).images, live.frame(1).images)
 
 
 def test_transforms_keep_what_a_dropped_frame_is_worth(folder: Path) -> None:
     live = open_source(f"watch:{folder}?behind=drop&queue=2", 0.25)
-    assert [disturbed(live, gain=0.5).frame(t).epoch_scale for t in (0, 9, 10)] == [0, 0, 0]
+    assert [through(live).frame(t).epoch_scale for t in (0, 9, 10)] == [0, 0, 0]
     assert live.frame(11).epoch_scale == 1
 
 
@@ -71,13 +72,11 @@ def test_a_frame_came_in_with_its_last_image_of_either_split(folder: Path, test_
     live = open_source(f"watch:{folder}", 0.25)
     late = live.info.train.ids[2]
     os.utime(folder / late / "000001.jpg", (0, 1012.5))
-    gained = disturbed(live, gain=0.5)
-    came = [source.frame(1, split).arrival for source in (live, gained) for split in ("train", "test")]
+    split = through(live)
+    came = [source.frame(1, split).arrival for source in (live, split) for split in ("train", "test")]
     assert came == [Arrival(1012.5)] * 4
     os.utime(folder / test_camera / "000001.jpg", (0, 1013.5))
-    assert [source.frame(1).arrival for source in (live, gained)] == [Arrival(1013.5)] * 2
-    ahead = disturbed(live, time_offset=(f"{late}@1",))
-    assert ahead.frame(1).arrival == Arrival(1020.0), "it waits for the next image of that camera"
+    assert [source.frame(1).arrival for source in (live, split)] == [Arrival(1013.5)] * 2
     assert open_source(str(folder), 0.25).frame(1).arrival is None
 
 
@@ -86,7 +85,7 @@ def test_a_frame_says_which_training_cameras_are_absent(folder: Path, test_camer
     name = live.info.train.ids[1]
     for camera in (name, test_camera):
         (folder / camera / "000001.jpg").unlink()
-    for source in (live, disturbed(live, gain=0.5)):
+    for source in (live, through(live)):
         arrivals = [source.frame(t).arrival for t in range(3)]
         assert [arrival and arrival.absent for arrival in arrivals] == [(), (name,), ()]
 
@@ -96,7 +95,7 @@ def test_a_frame_that_is_skipped_is_not_even_read(folder: Path, test_camera: str
     first = live.frame(0).images
     for camera in (live.info.train.ids[0], test_camera):
         (folder / camera / "000005.jpg").write_bytes(b"no picture")
-    for source in (live, disturbed(live, gain=1.0, noise_frames=1)):
+    for source in (live, through(live)):
         skipped = source.frame(5)
         assert (skipped.epoch_scale, skipped.images.tobytes()) == (0, first.tobytes()), "the last pictures stand in"
         assert skipped.arrival is not None
@@ -116,13 +115,13 @@ def test_a_frame_that_was_read_ahead_is_checked_again_when_its_turn_comes(
         for t in range(2, 12):
             (camera / f"{t:06d}.jpg").rename(later / camera.name / f"{t:06d}.jpg")
     live = open_source(f"watch:{folder}?behind={policy}&queue=2", 0.25)
-    through = disturbed(live, gain=0.5)
-    assert [through.frame(t).epoch_scale for t in (0, 1)] == [1, 1], "nothing waits yet"
+    split = through(live)
+    assert [split.frame(t).epoch_scale for t in (0, 1)] == [1, 1], "nothing waits yet"
     assert live.epoch_scale(1) == 1
     for image in later.glob("*/*.jpg"):
         image.rename(folder / image.parent.name / image.name)
     # Ten frames wait behind frame 1; frame 0 is always made in full.
-    assert [live.epoch_scale(0), through.epoch_scale(1), through.epoch_scale(11)] == worth
+    assert [live.epoch_scale(0), split.epoch_scale(1), split.epoch_scale(11)] == worth
 
 
 def test_an_image_that_comes_during_a_look_is_not_given_up(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gsstream.spec import CommandSpec, hookimpl
+from gsstream.spec import CommandSpec, ComponentSpec, hookimpl
 
 GROUP = "Measure"
 #: name -> (function or Typer app in ``gsstream_lab.commands``, one line for ``gsstream --help``)
@@ -20,6 +20,19 @@ COMMANDS = {
     "left-behind": ("left_behind:left_behind", "Count the Gaussians that stay behind the body they belong to."),
     "bench": ("bench:app", "Measure rendering or a frame step here."),
 }
+
+
+@hookimpl
+def gsstream_components() -> list[ComponentSpec]:
+    """The source that disturbs another one, for sweeps."""
+    return [
+        ComponentSpec(
+            kind="source",
+            name="disturbed",
+            target="gsstream_lab.disturbed:open_disturbed",
+            summary="another recording under gain, noise, lost images or clocks that are off",
+        )
+    ]
 
 
 @hookimpl

@@ -11,50 +11,46 @@ A stream names the whole URI as its recording, so that evaluating and resuming s
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from gsstream.core.errors import SourceError, suggest
+from gsstream.core.errors import SourceError
 from gsstream.core.frame import Arrival, Frame
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
 from gsstream.core.storage import packed
+from gsstream.discovery.catalog import load_catalog
+from gsstream.engine.run.recording import open_plain
 from gsstream.input.recordings.base import Moment, Source, SourceInfo, Split, Wrapped, assembled, check_index
-from gsstream.input.recordings.options import Disturbances, validated
-from gsstream.input.recordings.transforms import (
+from gsstream_lab.disturbances import (
+    Disturbances,
     gain_at,
     is_lost,
+    parse_disturbances,
     parse_losses,
     parse_offsets,
     with_gain,
     with_noise,
 )
 
-_KEYS = ("seed", *Disturbances.model_fields)
-_PER_CAMERA = ("lost_cameras", "time_offset")
 
+def open_disturbed(uri: str, scale: float = 1.0) -> Source:
+    """Open ``disturbed:KEY=VALUE,...:URI``; URI may be that of any source, also of another one that is disturbed.
 
-def parse_disturbances(text: str) -> tuple[Disturbances, int]:
-    """Read options and seed from ``"KEY=VALUE,..."``.
-
-    Raises SourceError naming an unknown key or an impossible value.
+    Raises SourceError for an unknown key, and what opening URI raises.
     """
-    values: dict[str, Any] = {}
-    for part in text.split(",") if text else ():
-        key, equals, value = part.partition("=")
-        if not equals or key not in _KEYS:
-            near = suggest(key, _KEYS) if equals else ""
-            raise SourceError(f"disturbed source: expected KEY=VALUE,..., got {part!r}{near}; keys: {', '.join(_KEYS)}")
-        if key in values:
-            raise SourceError(f"disturbed source: {key!r} is given twice")
-        values[key] = tuple(value.split("+")) if key in _PER_CAMERA else value
-    seed = str(values.pop("seed", "0"))
-    if not re.fullmatch(r"\d{1,9}", seed):
-        raise SourceError(f"disturbed source: seed: expected a whole number from 0, got {seed!r}")
-    return validated(Disturbances, values, "disturbed source"), int(seed)
+    text, colon, inner = uri.removeprefix("disturbed:").partition(":")
+    if not colon:
+        raise SourceError(f"source {uri[:200]!r}: expected disturbed:KEY=VALUE,...:URI, e.g. disturbed:gain=0.8:demo")
+    options, seed = parse_disturbances(text)
+    source = open_plain(inner, scale, load_catalog())
+    try:
+        return DisturbedSource(source, options, seed, uri)
+    except SourceError:
+        source.close()
+        raise
 
 
 class DisturbedSource(Wrapped):

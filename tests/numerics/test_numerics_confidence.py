@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gsstream_s2gs.normalise import robust
-from gsstream_s2gs.view_gradient import ViewSpaceGradient
+from gsstream_s2gs.view_gradient import LIMIT, ViewSpaceGradient
 from hypothesis import given
 from hypothesis import strategies as st
 from numeric_scenes import dictated, some
@@ -17,7 +17,6 @@ from numeric_scenes import dictated, some
 from gsstream.core.errors import ShapeError
 from gsstream.testing.cases import get_case
 
-LIMIT = ViewSpaceGradient.Config().limit
 NORMALISATIONS = {
     "robust": {},
     "robust, relative": {"epsilon_mode": "relative"},

@@ -18,6 +18,15 @@ from gsstream.parts.motion.groups import changed_groups, known_groups
 from gsstream.parts.motion.newton import BodySettings, Damping, fit_transforms_newton
 from gsstream.parts.render.work import FitContext
 
+#: Classes of brightness; the Gaussians of a cell and a class are a group.
+BRIGHTNESS_BINS = 2
+#: Share of a group's mean curvature that is added to it.
+DAMPING = 0.1
+#: Curvature that draws a group to its body, per pixel^2.
+BODY_HOLD = 500.0
+#: Longest step of a group, pixels at a width of 320.
+LONGEST = 0.5
+
 
 class Units(NamedTuple):
     """Steps that move a group by a pixel: ``translation`` [scene units], ``rotation`` [tan(angle / 2)] at its edge."""
@@ -43,16 +52,12 @@ class Rigid(MotionPart):
 
     class Config(PartConfig):
         pixels: float = Field(default=12.0, gt=0, le=1000, description="side of a group, pixels at a width of 320")
-        brightness_bins: int = Field(default=2, ge=1, le=16, description="classes of brightness, each its own group")
         votes: float = Field(
             default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in changed tiles"
         )
         share: float = Field(default=0.5, ge=0, le=1, description="share of a group's Gaussians that must lie there")
         epochs: int = Field(
             default=2, ge=1, le=100, description="passes over the training cameras; a hurried frame makes its share"
-        )
-        damping: float = Field(
-            default=0.1, ge=0, le=100, description="share of a group's mean curvature that is added to it"
         )
         hold: float = Field(
             default=40.0, gt=0, le=1e6, description="curvature that holds every group back besides, per pixel^2"
@@ -64,10 +69,6 @@ class Rigid(MotionPart):
             description="loss that joining two neighbours to a body may cost after the first pass, summed over all "
             "values of all images, as a multiple of the square root of their number; 0: no bodies",
         )
-        body_hold: float = Field(
-            default=500.0, gt=0, le=1e6, description="curvature that draws a group to its body, per pixel^2"
-        )
-        longest: float = Field(default=0.5, gt=0, le=10, description="longest step, pixels at a width of 320")
         step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
         least: float = Field(default=0.25, ge=0, le=10, description="motions below this many pixels are dropped")
 
@@ -77,7 +78,7 @@ class Rigid(MotionPart):
     def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion, ...]:
         config = self.config
         side = config.pixels * enlargement(work.cameras.width)
-        groups = known_groups(scene, work.cameras, side, config.brightness_bins)
+        groups = known_groups(scene, work.cameras, side, BRIGHTNESS_BINS)
         able = changed_groups(groups, work, config.votes, config.share)
         if not able.any():
             return ()
@@ -110,10 +111,10 @@ class Rigid(MotionPart):
         """[K, 6] shift and turn of the groups that explain the images best."""
         config = self.config
         total = work.scaled(config.epochs * len(work.cameras))
-        damping = Damping(config.damping, config.hold, config.longest * enlargement(work.cameras.width))
+        damping = Damping(DAMPING, config.hold, LONGEST * enlargement(work.cameras.width))
         # What noise adds to a sum of so many values grows as the root of their number.
         values = 3 * work.cameras.height * work.cameras.width * len(work.cameras)
-        bodies = BodySettings(config.body_cost * values**0.5, config.body_hold)
+        bodies = BodySettings(config.body_cost * values**0.5, BODY_HOLD)
         order = rng.numpy("motion", work.index)
         return fit_transforms_newton(
             work, start, units.row, iterations=total, order=order, damping=damping, settings=bodies

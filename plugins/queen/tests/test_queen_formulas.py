@@ -16,8 +16,6 @@ from gsstream_queen.settings import (
     ChangeSettings,
     GateSettings,
     GrowthSettings,
-    LatentPolicy,
-    MaskSettings,
     QueenConfig,
 )
 from gsstream_queen.trainable import OldRows
@@ -45,9 +43,11 @@ class TestGates:
     @given(st.floats(-BOUND, BOUND), st.floats(0.05, 3), st.floats(-3, -0.01), st.floats(1.001, 4))
     def test_more_likely_open_than_not_is_open(self, logit: float, t: float, gamma: float, eta: float) -> None:
         """Without noise the gate is above 0 exactly where its logit exceeds the shift, i.e. P(open) > 1/2."""
-        settings = GateSettings(temperature=t, gamma=gamma, eta=eta)
-        value = torch.tensor([logit], dtype=torch.float64)
-        p, g = float(open_probability(value, settings)), float(gates(value, settings))
+        settings, value = GateSettings(temperature=t), torch.tensor([logit], dtype=torch.float64)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("gsstream_queen.gates.GAMMA", gamma)
+            patch.setattr("gsstream_queen.gates.ETA", eta)
+            p, g = float(open_probability(value, settings)), float(gates(value, settings))
         assert 0 <= g <= 1
         if abs(p - 0.5) > 1e-9:
             assert (g > 0) == (p > 0.5)
@@ -91,10 +91,9 @@ class TestLatents:
         assert bool((square[0] == 1).all())
 
     def test_a_sent_decoder_gives_its_weights_back(self) -> None:
-        for basis, shape in (("learned", (3, 2)), ("cosine", (1, 1))):
-            policy = LatentPolicy(latent=3, lr=0.1, decoder_lr=0, decoder_std=1, basis=basis)
+        for name, shape in (("scales", (3, 2)), ("opacities", (1, 1))):
             weight = torch.randn(shape, generator=torch.Generator().manual_seed(1))
-            assert torch.equal(weight_of(decoder(weight, policy, 2), policy), weight)
+            assert torch.equal(weight_of(name, decoder(name, weight, 3, 2)), weight)
 
     def test_rounding_is_real_and_its_gradient_straight(self) -> None:
         value = torch.tensor([0.4, 0.6, -1.5, 2.5, 7.0], requires_grad=True)
@@ -191,20 +190,22 @@ class TestChange:
     def test_still_images_change_nothing(self) -> None:
         assert float(gradient_difference(get_case("moving").blended(0), ChangeSettings()).difference.max()) == 0  # type: ignore[arg-type]
 
-    def test_tiles_follow_the_dynamic_rows(self) -> None:
+    def test_tiles_follow_the_dynamic_rows(self, monkeypatch: pytest.MonkeyPatch) -> None:
         case = get_case("moving")
         everyone = torch.ones(len(case.gaussians), dtype=torch.bool)
-        settings = MaskSettings(pixels=1, dilate=0)
-        masks = changed_tiles(case, everyone, RENDERER, settings)  # type: ignore[arg-type]
+        monkeypatch.setattr("gsstream_queen.change.PIXELS", 1)
+        monkeypatch.setattr("gsstream_queen.change.DILATE", 0)
+        masks = changed_tiles(case, everyone, RENDERER)  # type: ignore[arg-type]
         assert len(masks) == len(case.cameras)
         for view, mask in enumerate(masks):
             alpha = RENDERER.render(case.gaussians, case.cameras, view, (0.0, 0.0, 0.0)).alpha.detach().numpy() > 0.5
             for row, column in np.ndindex(*mask.shape):
                 tile = alpha[row * 16 : row * 16 + 16, column * 16 : column * 16 + 16]
                 assert bool(mask[row, column]) == (tile.sum() >= tile.size / 256), (view, row, column)
-        wide = changed_tiles(case, everyone, RENDERER, MaskSettings(pixels=1, dilate=2))  # type: ignore[arg-type]
+        monkeypatch.setattr("gsstream_queen.change.DILATE", 2)
+        wide = changed_tiles(case, everyone, RENDERER)  # type: ignore[arg-type]
         assert all(bool(mask.all()) for mask, small in zip(wide, masks, strict=True) if small.any())
-        none = changed_tiles(case, ~everyone, RENDERER, settings)  # type: ignore[arg-type]
+        none = changed_tiles(case, ~everyone, RENDERER)  # type: ignore[arg-type]
         assert not any(bool(mask.any()) for mask in none)
 
 

@@ -125,7 +125,10 @@ def test_gates_close_where_they_cost(tmp_path: Path) -> None:
     ("setting", "message"),
     [
         ("streaming_method.sh0.latnt=3", "unknown key 'streaming_method.params.sh0.latnt'; did you mean 'latent'?"),
-        ("streaming_method.gate.gamma=0.5", "streaming_method.params.gate.gamma: input should be less than 0, got 0.5"),
+        (
+            "streaming_method.gate.l0=-1",
+            "streaming_method.params.gate.l0: input should be greater than or equal to 0, got -1",
+        ),
         ("stream.rd_lambda=0.5", "stream.rd_lambda: the streaming_method 'queen' does not read it"),
     ],
 )

@@ -60,7 +60,7 @@ class TestLatent:
 
     def test_one_number_may_be_changed(self) -> None:
         changed = LatentResidual.Config.model_validate({"sh0": {"lr": 0.05}, "means": {"step": 0.1}})
-        assert changed.sh0 == LatentCode(latent=4, lr=0.05, decoder_std=0.01, decoder_lr=1e-3)
+        assert changed.sh0 == LatentCode(latent=4, lr=0.05, decoder_std=0.01)
         assert changed.means.step == 0.1
         assert changed.means.lr == LatentResidual.Config().means.lr
         assert changed.quats == LatentResidual.Config().quats

@@ -12,6 +12,9 @@ from pydantic import Field
 
 from gsstream.api import GateSampler, GateTraits, PartConfig, check_finite
 
+#: Logits are kept in [-LOGIT_BOUND, LOGIT_BOUND]: probabilities from 0.001 to 0.999 (released code).
+LOGIT_BOUND = math.log(1000.0)
+
 
 @final
 class BinarySteGate(GateSampler):
@@ -30,12 +33,6 @@ class BinarySteGate(GateSampler):
     class Config(PartConfig):
         temperature: float = Field(
             default=0.3, ge=0.01, le=100, description="tau, softness of the gradient, no unit, 0.01 to 100 (paper: 0.3)"
-        )
-        logit_bound: float = Field(
-            default=math.log(1000.0),
-            gt=0,
-            le=50,
-            description="logits are kept in [-bound, bound], 0 to 50; ln(1000) is p = 0.001 to 0.999 (released code)",
         )
         noise: Literal["logistic", "none"] = Field(
             default="logistic", description="while training; logistic: paper; none: released training"
@@ -88,5 +85,5 @@ class BinarySteGate(GateSampler):
         return torch.sigmoid(logits)
 
     def bound(self, logits: torch.Tensor) -> torch.Tensor:
-        """Project the logits into [-logit_bound, logit_bound]."""
-        return logits.clamp(-self.config.logit_bound, self.config.logit_bound)
+        """Project the logits into [-LOGIT_BOUND, LOGIT_BOUND]."""
+        return logits.clamp(-LOGIT_BOUND, LOGIT_BOUND)

@@ -19,6 +19,13 @@ from gsstream.blocks import (
 )
 from gsstream_comgs.influence import KeyPoints, field_of
 
+#: Share of its views in which a Gaussian must lie in what changed.
+VOTES = 0.75
+#: Adam's learning rate of what a key point influences: log sizes and a quaternion.
+LR_INFLUENCE = 0.02
+#: Side of the cells that are sent, pixels at a width of 320.
+CELL = 6.0
+
 
 def gradient_difference(work: FitContext) -> torch.Tensor:
     """Return [N]: how much the gradient by every Gaussian's 2-D mean changed since the frame before.
@@ -47,18 +54,11 @@ class KeyPointMotion(MotionPart):
     class Config(PartConfig):
         keypoints: int = Field(default=200, ge=1, le=10_000, description="key points in a frame at most")
         epochs: int = Field(default=8, ge=1, le=1000, description="passes over the training cameras")
-        votes: float = Field(
-            default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in what changed"
-        )
         lr: float = Field(default=0.25, gt=0, le=10, description="step of shifts and turns, pixels at a width of 320")
-        lr_influence: float = Field(default=0.02, gt=0, le=1, description="step of influences: log size, quaternion")
-        pixels: float = Field(
-            default=6.0, gt=0, le=1000, description="side of the cells that are sent, pixels at a width of 320"
-        )
         step: float = Field(default=0.1, gt=0, le=10, description="quantisation step, pixels")
 
     def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion, ...]:
-        rows = work.changed_rows(self.config.votes).nonzero()[:, 0]
+        rows = work.changed_rows(VOTES).nonzero()[:, 0]
         difference = gradient_difference(work.everywhere())[rows]
         number = min(self.config.keypoints, int((difference > 0).sum()))
         if number == 0:
@@ -79,7 +79,7 @@ def _fitted(
     """The motion that ``chosen`` of the rows [A], as key points, fit to the images."""
     number, epochs = len(chosen), work.scaled(settings.epochs)
     pixel, wide = pixel_size(scene.gaussians.means, work.cameras), enlargement(work.cameras.width)
-    side = float(np.float32(settings.pixels * wide * pixel))
+    side = float(np.float32(CELL * wide * pixel))
     base = scene.gaussians.rows(rows.numpy()).map(torch.from_numpy)
     work.narrow(rows)
     shape = _start(base.means[chosen], pixel)
@@ -90,7 +90,7 @@ def _fitted(
     adam = torch.optim.Adam(
         [
             {"params": list(leaves.values()), "lr": settings.lr * wide},
-            {"params": list(shapes.values()), "lr": settings.lr_influence},
+            {"params": list(shapes.values()), "lr": LR_INFLUENCE},
         ]
     )
 

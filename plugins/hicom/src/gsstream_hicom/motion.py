@@ -34,6 +34,8 @@ from gsstream.blocks import (
 
 #: The box whose volume the cells share holds this part of the Gaussians along each axis.
 BOX = (0.05, 0.95)
+#: Share of its views in which a Gaussian must lie in what changed.
+VOTES = 0.75
 
 
 @final
@@ -60,16 +62,13 @@ class CoherentMotion(MotionPart):
             description="what a step is divided by; each: every number of a cell by its own gradient (Adam); cell: all "
             "six by the largest",
         )
-        votes: float = Field(
-            default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in what changed"
-        )
 
     def claims(self) -> MotionTraits:
         return MotionTraits(finds_motion=True, momentum=self.config.momentum)
 
     def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion, ...]:
         config, start, motions = self.config, scene, []
-        rows = work.changed_rows(config.votes).nonzero()[:, 0].cpu().numpy()
+        rows = work.changed_rows(VOTES).nonzero()[:, 0].cpu().numpy()
         pixel, order = pixel_size(scene.gaussians.means, work.cameras), rng.numpy("hicom", work.index)
         lr = config.lr * enlargement(work.cameras.width)
         total = work.scaled(config.epochs) * len(work.cameras)

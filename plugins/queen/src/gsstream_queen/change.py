@@ -8,7 +8,14 @@ import torch
 
 from gsstream.api import FrameTools, Renderer
 from gsstream.blocks import count_per_tile
-from gsstream_queen.settings import ChangeSettings, MaskSettings
+from gsstream_queen.settings import ChangeSettings
+
+#: A pixel changed where dynamic Gaussians alone reach this alpha.
+ALPHA = 0.5
+#: Changed pixels that make a tile of 16 x 16 a changed one.
+PIXELS = 40
+#: Tiles by which the mask grows (published: 48 pixels).
+DILATE = 1
 
 TILE = 16
 #: Inside the root of the colour distance, image units squared: no 0/0 where a pixel is exact.
@@ -58,9 +65,7 @@ def _direction(image: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
     return difference / (difference.square().sum(-1, keepdim=True) + EPSILON).sqrt()
 
 
-def changed_tiles(
-    work: FrameTools, dynamic: torch.Tensor, renderer: Renderer, settings: MaskSettings
-) -> list[torch.Tensor]:
+def changed_tiles(work: FrameTools, dynamic: torch.Tensor, renderer: Renderer) -> list[torch.Tensor]:
     """Per view [ceil(H / 16), ceil(W / 16)] bool: where the dynamic Gaussians [N] bool, drawn alone, are opaque."""
     cameras = work.cameras
     rows, columns = -(-cameras.height // TILE), -(-cameras.width // TILE)
@@ -71,8 +76,8 @@ def changed_tiles(
     for view in range(len(cameras)):
         with torch.no_grad():
             alpha = renderer.render(alone, cameras, view, (0.0, 0.0, 0.0)).alpha
-        count, size = count_per_tile((alpha > settings.alpha).numpy())
-        changed = torch.from_numpy(count >= size * settings.pixels / TILE**2).float()[None, None]
-        kernel = 2 * settings.dilate + 1
-        masks.append(torch.nn.functional.max_pool2d(changed, kernel, 1, settings.dilate)[0, 0] > 0)
+        count, size = count_per_tile((alpha > ALPHA).numpy())
+        changed = torch.from_numpy(count >= size * PIXELS / TILE**2).float()[None, None]
+        kernel = 2 * DILATE + 1
+        masks.append(torch.nn.functional.max_pool2d(changed, kernel, 1, DILATE)[0, 0] > 0)
     return masks

@@ -8,13 +8,15 @@ import torch
 
 from gsstream_queen.settings import GateSettings
 
+#: Ends of the interval that the sigmoid is stretched to (published gamma and eta).
+GAMMA, ETA = -0.5, 1.01
 #: Logits are kept within ln 1000: a gate can be surer than that of nothing (released code of the family).
 BOUND = math.log(1000.0)
 
 
 def open_logit(settings: GateSettings) -> float:
-    """Logit at which the stretched gate begins to open: temperature * ln(-gamma / eta)."""
-    return settings.temperature * math.log(-settings.gamma / settings.eta)
+    """Logit at which the stretched gate begins to open: temperature * ln(-GAMMA / ETA)."""
+    return settings.temperature * math.log(-GAMMA / ETA)
 
 
 def initial_logits(difference: torch.Tensor, seen: torch.Tensor, settings: GateSettings) -> torch.Tensor:
@@ -33,7 +35,7 @@ def initial_logits(difference: torch.Tensor, seen: torch.Tensor, settings: GateS
 def gates(logits: torch.Tensor, settings: GateSettings) -> torch.Tensor:
     """[N] in [0, 1], exactly 0 and 1 at the ends; no gradient there, as published."""
     soft = torch.sigmoid(logits / settings.temperature)
-    return (soft * (settings.eta - settings.gamma) + settings.gamma).clamp(0, 1)
+    return (soft * (ETA - GAMMA) + GAMMA).clamp(0, 1)
 
 
 def open_probability(logits: torch.Tensor, settings: GateSettings) -> torch.Tensor:

@@ -11,6 +11,10 @@ from gsstream.api import Gaussians, Rng
 from gsstream_queen.settings import LatentPolicy
 
 Tensors = dict[str, torch.Tensor]
+#: Attribute -> Adam learning rate of its decoder, raw units per iteration.
+DECODER_LRS = {"quats": 1e-3, "scales": 1e-4, "opacities": 1e-4, "sh0": 1e-3, "shN": 1e-4}
+#: Attributes whose decoders are cosines times one learned number; of others every entry is learned.
+COSINE = ("opacities",)
 
 
 def width(gaussians: Gaussians[torch.Tensor], name: str) -> int:
@@ -27,14 +31,14 @@ def initial_weights(policies: Mapping[str, LatentPolicy], gaussians: Gaussians[t
     """Attribute -> what is learned of its decoder: all entries [L, D], or one number [1, 1] (cosine)."""
     found = {}
     for name, policy in coded(policies, gaussians).items():
-        shape = (policy.latent, width(gaussians, name)) if policy.basis == "learned" else (1, 1)
+        shape = (policy.latent, width(gaussians, name)) if name not in COSINE else (1, 1)
         found[name] = torch.randn(shape, generator=rng.stream(f"queen decoder {name}")) * policy.decoder_std
     return found
 
 
-def decoder(weight: torch.Tensor, policy: LatentPolicy, columns: int) -> torch.Tensor:
-    """[L, D] decoder of learned weights."""
-    return weight if policy.basis == "learned" else weight * cosines(policy.latent, columns)
+def decoder(name: str, weight: torch.Tensor, latent: int, columns: int) -> torch.Tensor:
+    """Return the decoder [L, D] of an attribute from its learned weights."""
+    return weight * cosines(latent, columns) if name in COSINE else weight
 
 
 def cosines(latent: int, columns: int) -> torch.Tensor:
@@ -43,10 +47,10 @@ def cosines(latent: int, columns: int) -> torch.Tensor:
     return torch.cos(math.pi * rows * (2 * places + 1) / (2 * latent))
 
 
-def weight_of(sent: torch.Tensor, policy: LatentPolicy) -> torch.Tensor:
-    """The learned weights behind a decoder [L, D] that was sent."""
+def weight_of(name: str, sent: torch.Tensor) -> torch.Tensor:
+    """Return the learned weights behind the decoder [L, D] of an attribute that was sent."""
     # The first row of the cosine basis is 1 everywhere.
-    return sent if policy.basis == "learned" else sent[:1, :1].clone()
+    return sent[:1, :1].clone() if name in COSINE else sent
 
 
 def rounded(values: torch.Tensor) -> torch.Tensor:

@@ -71,7 +71,7 @@ class Queen(StreamingMethod[QueenState]):
         scene = player.gaussians.map(torch.from_numpy)
         policies = coded(self.config.latents(), scene)
         drawn = initial_weights(policies, scene, tools.rng)
-        sent = {n: weight_of(torch.from_numpy(value), policies[n]) for n, value in player.decoders.items()}
+        sent = {n: weight_of(n, torch.from_numpy(value)) for n, value in player.decoders.items()}
         return {**drawn, **sent}
 
     def step(self, state: QueenState, frame: Frame, tools: Tools) -> Step[QueenState]:
@@ -114,7 +114,7 @@ class Queen(StreamingMethod[QueenState]):
     def _masks(self, work: FrameTools, dynamic: torch.Tensor, tools: Tools) -> list[torch.Tensor] | None:
         if self.config.mask.share == 0:
             return None
-        return changed_tiles(work, dynamic, tools.renderer, self.config.mask)
+        return changed_tiles(work, dynamic, tools.renderer)
 
     def _send(self, state: QueenState, frame: Frame, tools: Tools, delta: Delta) -> Step[QueenState]:
         packet, player = send_delta(state.player, delta)

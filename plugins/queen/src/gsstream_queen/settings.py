@@ -27,12 +27,8 @@ class LatentPolicy(PartConfig):
     policy: Literal["latent", "frozen"] = Field(default="latent", description="latent: coded; frozen: never changes")
     latent: int = Field(ge=1, le=64, description="latent channels per Gaussian, 1 to 64")
     lr: float = Field(ge=0, le=10, description="Adam learning rate of the latents, symbols per iteration, to 10")
-    decoder_lr: float = Field(ge=0, le=1, description="Adam learning rate of the decoder, raw units per step, to 1")
     decoder_std: float = Field(
         gt=0, le=10, description="standard deviation of the decoder's initial entries, raw units per symbol, to 10"
-    )
-    basis: Literal["learned", "cosine"] = Field(
-        default="learned", description="learned: every entry; cosine: cosines times one learned number"
     )
 
 
@@ -57,8 +53,6 @@ class GateSettings(PartConfig):
     """Hard-concrete gates (Louizos et al. 2018), without noise."""
 
     temperature: float = Field(default=0.3, ge=0.01, le=10, description="temperature, 0.01 to 10")
-    gamma: float = Field(default=-0.5, ge=-10, lt=0, description="lower end of the stretched interval, -10 to 0")
-    eta: float = Field(default=1.01, gt=1, le=10, description="upper end of the stretched interval, 1 to 10")
     lr: float = Field(default=0.1, ge=0, le=10, description="Adam learning rate of the logits, to 10")
     l0: float = Field(default=0.01, ge=0, le=100, description="weight of the probability to be open, to 100")
     l0_over: Literal["sum", "mean"] = Field(
@@ -70,13 +64,6 @@ class MaskSettings(PartConfig):
     """The first part of a frame looks only at what changed."""
 
     share: float = Field(default=0.3, ge=0, le=1, description="share of a frame's iterations that are masked, 0 to 1")
-    alpha: float = Field(
-        default=0.5, gt=0, lt=1, description="a pixel changed where dynamic Gaussians alone reach this alpha, 0 to 1"
-    )
-    pixels: int = Field(
-        default=40, ge=1, le=256, description="changed pixels that make a 16 x 16 tile a changed one, 1 to 256"
-    )
-    dilate: int = Field(default=1, ge=0, le=16, description="tiles by which the mask grows, to 16 (published: 48 px)")
 
 
 class GrowthSettings(PartConfig):
@@ -102,20 +89,18 @@ class QueenConfig(PartConfig):
 
     means: PositionPolicy = Field(default=PositionPolicy(), description="centres")
     quats: LatentPolicy = Field(
-        default=LatentPolicy(latent=6, lr=0.025, decoder_lr=1e-3, decoder_std=1e-2), description="raw quaternions"
+        default=LatentPolicy(latent=6, lr=0.025, decoder_std=1e-2), description="raw quaternions"
     )
-    scales: LatentPolicy = Field(
-        default=LatentPolicy(latent=8, lr=0.01, decoder_lr=1e-4, decoder_std=1e-3), description="log sizes"
-    )
+    scales: LatentPolicy = Field(default=LatentPolicy(latent=8, lr=0.01, decoder_std=1e-3), description="log sizes")
     opacities: LatentPolicy = Field(
-        default=LatentPolicy(latent=3, lr=0.05, decoder_lr=1e-4, decoder_std=1e-4, basis="cosine"),
+        default=LatentPolicy(latent=3, lr=0.05, decoder_std=1e-4),
         description="opacity logits",
     )
     sh0: LatentPolicy = Field(
-        default=LatentPolicy(latent=8, lr=0.0125, decoder_lr=1e-3, decoder_std=1e-4), description="degree-0 colour"
+        default=LatentPolicy(latent=8, lr=0.0125, decoder_std=1e-4), description="degree-0 colour"
     )
     shN: LatentPolicy = Field(
-        default=LatentPolicy(latent=4, lr=0.000625, decoder_lr=1e-4, decoder_std=1e-1), description="higher colour"
+        default=LatentPolicy(latent=4, lr=0.000625, decoder_std=1e-1), description="higher colour"
     )
     gate: GateSettings = Field(default=GateSettings(), description="gates of positions")
     mask: MaskSettings = Field(default=MaskSettings(), description="masked first part of a frame")

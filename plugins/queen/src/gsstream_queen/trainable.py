@@ -10,7 +10,7 @@ import torch
 from gsstream.api import ATTRIBUTES, Gaussians
 from gsstream.blocks import bit_price_factor, rate_gradient
 from gsstream_queen.gates import BOUND, gates, open_probability
-from gsstream_queen.latents import Tensors, coded, decoder, rounded, width
+from gsstream_queen.latents import DECODER_LRS, Tensors, coded, decoder, rounded, width
 from gsstream_queen.settings import QueenConfig
 
 #: 3DGS, raw units per iteration (centres: fraction of the rig's extent from the settings).
@@ -55,7 +55,7 @@ class OldRows:
         self._logits = logits.clone().requires_grad_()
         self._moving = config.means.policy != "frozen" and config.means.lr > 0
         groups = [{"params": [self._latents[name]], "lr": policy.lr} for name, policy in self._policies.items()]
-        groups += [{"params": [self._weights[name]], "lr": p.decoder_lr} for name, p in self._policies.items()]
+        groups += [{"params": [self._weights[name]], "lr": DECODER_LRS[name]} for name in self._policies]
         if self._moving:
             # The shift is counted in steps of the quantiser, so that symbols are its rounded values.
             groups.append({"params": [self._shift], "lr": config.means.lr / config.means.step})
@@ -68,7 +68,7 @@ class OldRows:
         changed = dict(self._base.items())
         for name, policy in self._policies.items():
             base = changed[name]
-            weight = decoder(self._weights[name], policy, width(self._base, name))
+            weight = decoder(name, self._weights[name], policy.latent, width(self._base, name))
             changed[name] = base + (rounded(self._latents[name]) @ weight).reshape(base.shape)
         if self._moving:
             changed["means"] = self._base.means + rounded(self._gated_translation()) * self._unit
@@ -115,7 +115,7 @@ class OldRows:
             if self._moving:
                 symbols["means"] = torch.round(self._gated_translation()).to(torch.int32)
             decoders = {
-                name: decoder(self._weights[name], policy, width(self._base, name)).detach().clone()
+                name: decoder(name, self._weights[name], policy.latent, width(self._base, name)).detach().clone()
                 for name, policy in self._policies.items()
             }
         return Solution(symbols, decoders)

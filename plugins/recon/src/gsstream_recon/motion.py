@@ -38,6 +38,9 @@ from gsstream.blocks import (
 )
 from gsstream_recon.anchors import AnchorLevels, Level, bound, followed, inherited
 
+#: Share of its views in which a Gaussian must lie in what changed.
+VOTES = 0.75
+
 
 @dataclass(frozen=True)
 class AnchoredCells:
@@ -87,9 +90,6 @@ class AnchorMotion(MotionPart):
             description="what a step is divided by; each: every number of an anchor by its own gradient (Adam); "
             "anchor: all six by the largest",
         )
-        votes: float = Field(
-            default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in what changed"
-        )
         pixels: float = Field(
             default=6.0, gt=0, le=1000, description="side of the cells that follow anchors, pixels at a width of 320"
         )
@@ -109,7 +109,7 @@ class AnchorMotion(MotionPart):
         pixel = pixel_size(means, work.cameras)
         side = float(np.float32(config.pixels * enlargement(work.cameras.width) * pixel))
         groups = groups_for(scene, side, 1, regroup=True)
-        rows = work.changed_rows(config.votes).nonzero()[:, 0].cpu().numpy()
+        rows = work.changed_rows(VOTES).nonzero()[:, 0].cpu().numpy()
         marks = groups_of_rows(groups, rows, work.shell_rows).astype(np.uint8)
         if not marks.any():
             return ()

@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import final
 
 import torch
-from pydantic import Field
 
-from gsstream.api import Hierarchy, PartConfig, Propagation, PropagationTraits, check_finite, check_shape, tree_max
+from gsstream.api import Hierarchy, Propagation, PropagationTraits, check_finite, check_shape, tree_max
+
+#: Logit of a tree without Gaussians.
+EMPTY = -50.0
 
 
 @final
@@ -24,11 +26,6 @@ class HierarchicalMax(Propagation):
 
     source = 'S2GS, equation for p_j ("HFP")'
 
-    class Config(PartConfig):
-        empty: float = Field(
-            default=-50.0, ge=-1e4, le=1e4, description="logit of a tree without Gaussians, -1e4 to 1e4"
-        )
-
     traits = PropagationTraits(
         conservative=True, idempotent=True, differentiable=True, normalised=True, parent_bound=True
     )
@@ -37,4 +34,4 @@ class HierarchicalMax(Propagation):
         """[N] logits -> [M] logits. Raises ShapeError for a wrong length, a value that is not finite, or a cycle."""
         check_shape("logits", logits, (hierarchy.num_gaussians,))
         check_finite("logits", logits)
-        return tree_max(logits, hierarchy, self.config.empty)
+        return tree_max(logits, hierarchy, EMPTY)

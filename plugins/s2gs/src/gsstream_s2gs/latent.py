@@ -9,6 +9,9 @@ from pydantic import Field, model_validator
 
 from gsstream.api import AttributeCode, PartConfig, UpdateRule
 
+#: Attribute -> Adam learning rate of its decoder, raw units per iteration.
+DECODER_LRS = {"quats": 1e-3, "scales": 1e-4, "opacities": 1e-4, "sh0": 1e-3, "shN": 1e-4}
+
 
 class OffsetCode(PartConfig):
     """Position residual, coded directly."""
@@ -25,7 +28,6 @@ class LatentCode(PartConfig):
     decoder_std: float = Field(
         gt=0, le=10, description="standard deviation of the decoder's initial entries, raw units per latent unit"
     )
-    decoder_lr: float = Field(ge=0, le=1, description="Adam learning rate of the decoder, raw units per iteration")
     step: float = Field(
         default=1.0, gt=0, le=64, description="quantisation step of the latents; larger: fewer bits, coarser change"
     )
@@ -58,22 +60,22 @@ class LatentResidual(UpdateRule):
     class Config(PartConfig):
         means: OffsetCode = Field(default=OffsetCode(), description="centres, in cells of the anchor")
         quats: LatentCode = Field(
-            default=LatentCode(latent=6, lr=0.1, decoder_std=0.005, decoder_lr=1e-3),
+            default=LatentCode(latent=6, lr=0.1, decoder_std=0.005),
             description="raw quaternion entries, no unit",
         )
         scales: LatentCode = Field(
-            default=LatentCode(latent=8, lr=0.2, decoder_std=0.01, decoder_lr=1e-4),
+            default=LatentCode(latent=8, lr=0.2, decoder_std=0.01),
             description="log standard deviations",
         )
         opacities: LatentCode = Field(
-            default=LatentCode(latent=1, lr=1.0, decoder_std=0.1, decoder_lr=1e-4), description="opacity logits"
+            default=LatentCode(latent=1, lr=1.0, decoder_std=0.1), description="opacity logits"
         )
         sh0: LatentCode = Field(
-            default=LatentCode(latent=4, lr=0.2, decoder_std=0.01, decoder_lr=1e-3),
+            default=LatentCode(latent=4, lr=0.2, decoder_std=0.01),
             description="degree-0 colour coefficients",
         )
         shN: LatentCode = Field(
-            default=LatentCode(latent=4, lr=0.03, decoder_std=0.003, decoder_lr=1e-4),
+            default=LatentCode(latent=4, lr=0.03, decoder_std=0.003),
             description="higher colour coefficients; absent at degree 0",
         )
 
@@ -92,9 +94,13 @@ class LatentResidual(UpdateRule):
     def codes(self) -> Mapping[str, AttributeCode]:
         """Attribute -> code; an attribute with ``lr`` 0 never changes."""
         entries = {"means": AttributeCode(step=self.config.means.step, lr=self.config.means.lr)}
-        for name in ("quats", "scales", "opacities", "sh0", "shN"):
+        for name in DECODER_LRS:
             code: LatentCode = getattr(self.config, name)
             entries[name] = AttributeCode(
-                step=code.step, lr=code.lr, latent=code.latent, decoder_lr=code.decoder_lr, decoder_std=code.decoder_std
+                step=code.step,
+                lr=code.lr,
+                latent=code.latent,
+                decoder_lr=DECODER_LRS[name],
+                decoder_std=code.decoder_std,
             )
         return {name: code for name, code in entries.items() if code.lr > 0}

@@ -11,6 +11,9 @@ from pydantic import Field
 
 from gsstream.api import ConfidenceEstimator, ConfidenceTraits, FrameContext, PartConfig, Rng, check_finite
 
+#: Logits are kept in [-LIMIT, LIMIT]: probabilities from 0.001 to 0.999 (released code).
+LIMIT = math.log(1000.0)
+
 
 @final
 class UniformRandom(ConfidenceEstimator):
@@ -24,21 +27,18 @@ class UniformRandom(ConfidenceEstimator):
 
     class Config(PartConfig):
         seed: int = Field(default=0, ge=0, description="seed of the draws, any integer from 0")
-        limit: float = Field(
-            default=math.log(1000.0), gt=0, le=50, description="logits are kept in [-limit, limit], 0 to 50"
-        )
 
     denied = MappingProxyType({"check_permutation": "numbers are drawn by row index, not by Gaussian"})
 
     def claims(self) -> ConfidenceTraits:
-        return ConfidenceTraits(floor=self.config.limit)
+        return ConfidenceTraits(floor=LIMIT)
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
-        """Logits [N] float32 in [-limit, limit]. Raises ShapeError when an image is not finite."""
+        """Logits [N] float32 in [-LIMIT, LIMIT]. Raises ShapeError when an image is not finite."""
         for view in range(len(context.cameras)):
             check_finite(f"image of view {view} at frame {context.index}", context.image(view))
         generator = Rng(self.config.seed).stream("s2gs/uniform-random", context.index)
         uniform = torch.rand(len(context.gaussians), generator=generator, dtype=torch.float64)
         # Half a step of the lattice k / 2^53: finite at both ends.
         logits = torch.logit(uniform.clamp(2.0**-54, 1 - 2.0**-53))
-        return logits.clamp(-self.config.limit, self.config.limit).float().to(context.gaussians.means.device)
+        return logits.clamp(-LIMIT, LIMIT).float().to(context.gaussians.means.device)

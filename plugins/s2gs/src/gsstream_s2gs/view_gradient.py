@@ -12,6 +12,15 @@ from pydantic import Field, model_validator
 from gsstream.api import ConfidenceEstimator, ConfidenceTraits, FrameContext, PartConfig, Rng, check_finite
 from gsstream_s2gs.normalise import minmax, noise_units, ratio, robust
 
+#: Logits are kept in [-LIMIT, LIMIT].
+LIMIT = 50.0
+#: Under the root of ``loss: l2norm``, image units^2, lest 0 be divided by 0.
+DISTANCE_EPSILON = 1e-12
+#: Multiple of the noise at which z is 0 (``normalisation: noise``).
+NOISE_THRESHOLD = 3.0
+#: Least noise of a camera, image units: 8-bit rounding of two frames.
+NOISE_MINIMUM = 0.4 / 255
+
 
 @final
 class ViewSpaceGradient(ConfidenceEstimator):
@@ -43,9 +52,6 @@ class ViewSpaceGradient(ConfidenceEstimator):
         loss: Literal["mse", "l2norm"] = Field(
             default="mse", description="E; mse: paper; l2norm: mean Euclidean distance of pixel colours (released code)"
         )
-        distance_epsilon: float = Field(
-            default=1e-12, gt=0, le=1, description="inside the root of l2norm, image units^2; no 0/0"
-        )
         aggregate: Literal["mean-vector", "sum-of-norms", "mean-of-norms"] = Field(
             default="mean-vector",
             description="over views; mean-vector: norm of the mean gradient (paper); sum-of-norms: released; "
@@ -57,7 +63,7 @@ class ViewSpaceGradient(ConfidenceEstimator):
         normalisation: Literal["robust", "ratio", "minmax", "noise"] = Field(
             default="robust",
             description="robust: paper; ratio: ln(m / median), released; minmax: paper's ablation; "
-            "noise: m in units of what camera noise alone would give, minus noise_threshold",
+            "noise: m in units of what camera noise alone would give, minus three of them",
         )
         statistics: Literal["touched", "seen"] = Field(
             default="touched",
@@ -69,15 +75,6 @@ class ViewSpaceGradient(ConfidenceEstimator):
         epsilon_mode: Literal["absolute", "relative"] = Field(
             default="absolute", description="absolute: paper; relative: epsilon * (median + MAD)"
         )
-        noise_threshold: float = Field(
-            default=3.0, ge=0, le=100, description="(noise) multiple of the noise where z is 0, to 100"
-        )
-        noise_minimum: float = Field(
-            default=0.4 / 255,
-            gt=0,
-            le=1,
-            description="(noise) least noise of a camera, image units; 0.4/255 is 8-bit rounding of two frames",
-        )
         perturbation: float = Field(
             default=0.0,
             ge=0,
@@ -88,7 +85,6 @@ class ViewSpaceGradient(ConfidenceEstimator):
         floor: float = Field(
             default=-math.log(1000.0), ge=-50, le=0, description="logit where nothing changes, -50 to 0"
         )
-        limit: float = Field(default=50.0, gt=0, le=1e4, description="logits are kept in [-limit, limit]")
 
         @model_validator(mode="after")
         def _combinations(self) -> ViewSpaceGradient.Config:
@@ -111,7 +107,7 @@ class ViewSpaceGradient(ConfidenceEstimator):
         )
 
     def estimate(self, context: FrameContext) -> torch.Tensor:
-        """Logits [N] float32 in [-limit, limit]. Raises ShapeError when a gradient is not finite."""
+        """Logits [N] float32 in [-LIMIT, LIMIT]. Raises ShapeError when a gradient is not finite."""
         config = self.config
         # Where it does not matter which Gaussians are seen, those that a change reaches are all there is to look at.
         few = config.aggregate == "mean-vector" and config.statistics == "touched" and config.normalisation != "noise"
@@ -124,16 +120,16 @@ class ViewSpaceGradient(ConfidenceEstimator):
             seen = magnitude > 0
         values = self._perturb(magnitude[seen], context.index)
         if config.normalisation == "robust":
-            chosen = robust(values, config.epsilon, config.epsilon_mode == "relative", config.limit)
+            chosen = robust(values, config.epsilon, config.epsilon_mode == "relative", LIMIT)
         elif config.normalisation == "ratio":
-            chosen = ratio(values, config.floor, config.limit)
+            chosen = ratio(values, config.floor, LIMIT)
         elif config.normalisation == "minmax":
-            chosen = minmax(values, config.limit)
+            chosen = minmax(values, LIMIT)
         else:
-            chosen = noise_units(values, expected[seen], config.noise_threshold, config.floor)
+            chosen = noise_units(values, expected[seen], NOISE_THRESHOLD, config.floor)
         # Whatever a change touches is never less likely to change than what it does not touch.
-        least = config.floor if config.statistics == "touched" else -config.limit
-        logits[seen if rows is None else rows[seen]] = chosen.clamp(least, config.limit)
+        least = config.floor if config.statistics == "touched" else -LIMIT
+        logits[seen if rows is None else rows[seen]] = chosen.clamp(least, LIMIT)
         return logits.float()
 
     def _reached(self, context: FrameContext) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -195,7 +191,7 @@ class ViewSpaceGradient(ConfidenceEstimator):
 
     def _direction(self, difference: torch.Tensor) -> torch.Tensor:
         """Derivative of sqrt(|d|^2 + eps): d over that root; 0 where render and ground truth agree."""
-        epsilon = self.config.distance_epsilon
+        epsilon = DISTANCE_EPSILON
         return difference / (difference.square().sum(-1, keepdim=True) + epsilon).sqrt()
 
     def _noise_upstream(self, context: FrameContext, view: int) -> torch.Tensor:
@@ -205,7 +201,7 @@ class ViewSpaceGradient(ConfidenceEstimator):
         name = context.cameras.ids[view]
         generator = Rng(self.config.seed).stream(f"s2gs/view-gradient/noise/{name}", context.index)
         draw = torch.randn(before.shape, generator=generator, dtype=before.dtype).to(before.device)
-        sigma: float = max(context.noise_sigma(view), self.config.noise_minimum)
+        sigma: float = max(context.noise_sigma(view), NOISE_MINIMUM)
         return 2 * sigma * draw / before.numel()
 
     def _perturb(self, values: torch.Tensor, index: int) -> torch.Tensor:

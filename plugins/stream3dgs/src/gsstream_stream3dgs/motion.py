@@ -25,6 +25,12 @@ from gsstream.blocks import approximate_by_cells, enlargement, pixel_size, rows_
 from gsstream_stream3dgs.cache import Cache, Lookup
 
 Setting = pydantic.Field
+#: Share of its views in which a Gaussian must lie in what changed.
+VOTES = 0.75
+#: Quantisation step of the network's weights.
+WEIGHT_STEP = 0.02
+#: Side of the cells that are sent instead of the weights, pixels at a width of 320.
+CELL = 6.0
 
 
 @final
@@ -55,23 +61,18 @@ class CacheMotion(MotionPart):
         box: float = Setting(
             default=0.02, ge=0, lt=0.5, description="share of the Gaussians outside the box at either end of each axis"
         )
-        votes: float = Setting(
-            default=0.75, ge=0, le=1, description="share of its views in which a Gaussian must lie in what changed"
-        )
         sent: Literal["field", "cells"] = Setting(
             default="field",
             description="field: the weights, as published; cells: rigid motions of cells, far fewer bytes",
         )
         entry_step: float = Setting(default=0.05, gt=0, le=1, description="quantisation step of the grid's entries")
-        weight_step: float = Setting(default=0.02, gt=0, le=1, description="quantisation step of the network's weights")
         rounded: float = Setting(
             default=0.5, ge=0, le=1, description="share of the passes, the last, that learn with rounded weights"
         )
-        pixels: float = Setting(default=6.0, gt=0, le=1000, description="sent as cells: side, pixels at a width of 320")
         step: float = Setting(default=0.1, gt=0, le=10, description="sent as cells: quantisation step, pixels")
 
     def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion | Field, ...]:
-        rows = work.changed_rows(self.config.votes).nonzero()[:, 0].numpy()
+        rows = work.changed_rows(VOTES).nonzero()[:, 0].numpy()
         rows = rows[rows < work.key_rows]
         if not len(rows):
             return ()
@@ -88,7 +89,7 @@ class CacheMotion(MotionPart):
         rows, unit = field_rows(scene, shape, marks)
         if not len(rows):
             return None
-        cache = Cache(shape, Lookup(shape, unit), config.entry_step, config.weight_step)
+        cache = Cache(shape, Lookup(shape, unit), config.entry_step, WEIGHT_STEP)
         base = scene.gaussians.rows(rows).map(torch.from_numpy)
         work.narrow(torch.from_numpy(rows))
         order, epochs = rng.numpy("stream3dgs/order", work.index), work.scaled(config.epochs)
@@ -132,7 +133,7 @@ class CacheMotion(MotionPart):
         with torch.no_grad():
             shift, turn = cache()
         pixel = pixel_size(scene.gaussians.means, work.cameras)
-        side = float(np.float32(self.config.pixels * enlargement(work.cameras.width) * pixel))
+        side = float(np.float32(CELL * enlargement(work.cameras.width) * pixel))
         return approximate_by_cells(
             scene,
             rows,

@@ -34,7 +34,7 @@ def fitted(scene: Scene, aims: np.ndarray, rows: np.ndarray, settings: Settings,
 
 
 def test_anchors_are_drawn_by_level_and_both_ends_could_draw_the_same() -> None:
-    settings = Settings(per_anchor=24, levels=3, ratio=3, every=2)
+    settings = Settings(per_anchor=24, levels=3, every=2)
     first = due(None, 5, 2160, settings, Rng(7))
     assert [len(rows) for rows in first.rows] == [10, 30, 90]
     assert set(first.rows[0]) < set(first.rows[1]) < set(first.rows[2]), "a finer level adds to the coarser ones"

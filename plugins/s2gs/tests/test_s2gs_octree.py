@@ -109,19 +109,18 @@ class TestSeed:
         assert torch.equal(a.levels, b.levels)
         torch.testing.assert_close(a.colors, b.colors)
 
-    def test_a_point_at_a_camera(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_a_point_at_a_camera(self) -> None:
         """Distance 0 asks for infinitely many levels; the cap answers, nothing is infinite or undefined."""
-        monkeypatch.setattr("gsstream_s2gs.octree.DISTANCE_QUANTILE", 1.0)
         cameras = rig(1)
         points = PointCloud(
             np.r_[cameras.centers, np.zeros((5, 3))].astype(np.float32), np.ones((6, 3), np.float32), "t"
         )
         at_camera = dataclasses.replace(cameras, viewmats=cameras.viewmats.copy())
-        anchors = octree(anchor="corner").seed(points, at_camera)
+        anchors = octree(distance_quantile=1.0, anchor="corner").seed(points, at_camera)
         assert len(anchors.cell_sizes) == 6
         assert torch.isfinite(anchors.positions).all()
         here = PointCloud(cameras.centers.astype(np.float32), np.ones((1, 3), np.float32), "t")
-        assert len(octree().seed(here, cameras).positions) >= 1
+        assert len(octree(distance_quantile=1.0).seed(here, cameras).positions) >= 1
 
     def test_a_cloud_that_cannot_be_seeded_is_refused(self) -> None:
         points, nobody = cloud(5), Cameras((), np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), 4, 4)

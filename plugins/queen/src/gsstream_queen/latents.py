@@ -13,6 +13,8 @@ from gsstream_queen.settings import LatentPolicy
 Tensors = dict[str, torch.Tensor]
 #: Attribute -> Adam learning rate of its decoder, raw units per iteration.
 DECODER_LRS = {"quats": 1e-3, "scales": 1e-4, "opacities": 1e-4, "sh0": 1e-3, "shN": 1e-4}
+#: Attribute -> standard deviation of its decoder's first entries, raw units per symbol (published).
+DECODER_STDS = {"quats": 1e-2, "scales": 1e-3, "opacities": 1e-4, "sh0": 1e-4, "shN": 1e-1}
 #: Attributes whose decoders are cosines times one learned number; of others every entry is learned.
 COSINE = ("opacities",)
 
@@ -32,7 +34,7 @@ def initial_weights(policies: Mapping[str, LatentPolicy], gaussians: Gaussians[t
     found = {}
     for name, policy in coded(policies, gaussians).items():
         shape = (policy.latent, width(gaussians, name)) if name not in COSINE else (1, 1)
-        found[name] = torch.randn(shape, generator=rng.stream(f"queen decoder {name}")) * policy.decoder_std
+        found[name] = torch.randn(shape, generator=rng.stream(f"queen decoder {name}")) * DECODER_STDS[name]
     return found
 
 

@@ -27,9 +27,6 @@ class LatentPolicy(PartConfig):
     policy: Literal["latent", "frozen"] = Field(default="latent", description="latent: coded; frozen: never changes")
     latent: int = Field(ge=1, le=64, description="latent channels per Gaussian, 1 to 64")
     lr: float = Field(ge=0, le=10, description="Adam learning rate of the latents, symbols per iteration, to 10")
-    decoder_std: float = Field(
-        gt=0, le=10, description="standard deviation of the decoder's initial entries, raw units per symbol, to 10"
-    )
 
 
 class ChangeSettings(PartConfig):
@@ -88,20 +85,14 @@ class QueenConfig(PartConfig):
     """Everything that can be told to the method."""
 
     means: PositionPolicy = Field(default=PositionPolicy(), description="centres")
-    quats: LatentPolicy = Field(
-        default=LatentPolicy(latent=6, lr=0.025, decoder_std=1e-2), description="raw quaternions"
-    )
-    scales: LatentPolicy = Field(default=LatentPolicy(latent=8, lr=0.01, decoder_std=1e-3), description="log sizes")
+    quats: LatentPolicy = Field(default=LatentPolicy(latent=6, lr=0.025), description="raw quaternions")
+    scales: LatentPolicy = Field(default=LatentPolicy(latent=8, lr=0.01), description="log sizes")
     opacities: LatentPolicy = Field(
-        default=LatentPolicy(latent=3, lr=0.05, decoder_std=1e-4),
+        default=LatentPolicy(latent=3, lr=0.05),
         description="opacity logits",
     )
-    sh0: LatentPolicy = Field(
-        default=LatentPolicy(latent=8, lr=0.0125, decoder_std=1e-4), description="degree-0 colour"
-    )
-    shN: LatentPolicy = Field(
-        default=LatentPolicy(latent=4, lr=0.000625, decoder_std=1e-1), description="higher colour"
-    )
+    sh0: LatentPolicy = Field(default=LatentPolicy(latent=8, lr=0.0125), description="degree-0 colour")
+    shN: LatentPolicy = Field(default=LatentPolicy(latent=4, lr=0.000625), description="higher colour")
     gate: GateSettings = Field(default=GateSettings(), description="gates of positions")
     mask: MaskSettings = Field(default=MaskSettings(), description="masked first part of a frame")
     growth: GrowthSettings = Field(default=GrowthSettings(), description="masked densification")

@@ -38,6 +38,10 @@ from gsstream.blocks import (
 )
 from gsstream_recon.anchors import AnchorLevels, Level, bound, followed, inherited
 
+#: Anchors of a level per anchor of the next coarser one.
+RATIO = 3.0
+#: Old anchors from which a new anchor inherits its motion.
+NEIGHBOURS = 3
 #: Share of its views in which a Gaussian must lie in what changed.
 VOTES = 0.75
 
@@ -77,11 +81,7 @@ class AnchorMotion(MotionPart):
         epochs: int = Field(default=5, ge=1, le=1000, description="passes over the training cameras")
         per_anchor: float = Field(default=24.0, ge=1, description="Gaussians per anchor of the finest level")
         levels: int = Field(default=3, ge=1, le=6, description="levels of anchors, whose motions add up")
-        ratio: float = Field(
-            default=3.0, ge=1, le=100, description="anchors of a level per anchor of the next coarser one"
-        )
         every: int = Field(default=2, ge=1, description="frames after which anchors are drawn anew")
-        neighbours: int = Field(default=3, ge=1, le=100, description="old anchors from which a new one inherits")
         momentum: float = Field(default=0.6, ge=0, le=1, description="share of the last frame's motion to begin with")
         lr: float = Field(default=0.25, gt=0, le=10, description="step of the fit, pixels at a width of 320")
         l1_weight: float = Field(default=0.0, ge=0, description="weight of the mean absolute motion, pixels")
@@ -138,7 +138,7 @@ class AnchorMotion(MotionPart):
         if memory is not None and frame - memory.drawn < config.every and all(map(len, memory.rows)):
             return memory
         order = rng.numpy("recon/anchors", frame).permutation(number)
-        sizes = [number / config.per_anchor / config.ratio**level for level in reversed(range(config.levels))]
+        sizes = [number / config.per_anchor / RATIO**level for level in reversed(range(config.levels))]
         return AnchorLevels(frame, tuple(np.sort(order[: max(1, round(size))]) for size in sizes))
 
     def _start(
@@ -152,7 +152,7 @@ class AnchorMotion(MotionPart):
         past[scene.displacement.rows] = np.concatenate([scene.displacement.translation, scene.displacement.rotation], 1)
         mean = Level(cells.center, cells.group).mean(past[cells.rows])
         old = levels if before is now else bound(cells.center, scene.gaussians.means, before)
-        return [self.config.momentum * motion for motion in inherited(mean, old, levels, self.config.neighbours)]
+        return [self.config.momentum * motion for motion in inherited(mean, old, levels, NEIGHBOURS)]
 
     def _fitted(
         self,

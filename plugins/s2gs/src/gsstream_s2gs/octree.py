@@ -27,9 +27,6 @@ from gsstream_s2gs import morton
 #: Cells on either side of the root cube that are told apart when Gaussians are grouped; farther ones share the last.
 FAR_CELLS = 1 << (morton.AXIS_BITS - 1)
 
-#: Quantile of distances taken as D_max (released code).
-DISTANCE_QUANTILE = 0.999
-
 
 @final
 class StreamingOctree(Structure):
@@ -38,7 +35,7 @@ class StreamingOctree(Structure):
     Seeding (paper, "Streaming Octree Representation" and its appendix; quantities the paper leaves open follow the
     released code):
 
-    1. D_max and D_min are the ``DISTANCE_QUANTILE`` and its complement of the point-camera distances, first per
+    1. D_max and D_min are the ``distance_quantile`` and its complement of the point-camera distances, first per
        training camera, then over all cameras. Levels: H = round(log_b(D_max / D_min)) + 1, at most ``max_levels``.
     2. A cube of side S around the points, each side ``padding`` times the largest extent away from them. The
        released code multiplies coordinates by 1.1, which cuts points off when all lie on one side of the origin.
@@ -66,6 +63,9 @@ class StreamingOctree(Structure):
             ge=1,
             le=21,
             description="upper bound on the number of levels H, 1 to 21; root_exponent + max_levels <= 22",
+        )
+        distance_quantile: float = Field(
+            default=0.999, gt=0.5, le=1, description="quantile of distances taken as D_max, 0.5 to 1 (released)"
         )
         visible_threshold: float = Field(
             default=0.9, ge=0, lt=1, description="share of cameras that must ask for a level, 0 to 1 (released)"
@@ -113,7 +113,7 @@ class StreamingOctree(Structure):
         """
         xyz, rgb = _checked(points, cameras)
         centers = torch.as_tensor(cameras.centers, dtype=torch.float64)
-        far, near = _distance_range(xyz, centers, DISTANCE_QUANTILE)
+        far, near = _distance_range(xyz, centers, self.config.distance_quantile)
         levels = self._num_levels(far, near)
         origin, side = self._cube(xyz, far)
         finest = _cells(xyz, origin, side / 2.0 ** (self.config.root_exponent + levels - 1))

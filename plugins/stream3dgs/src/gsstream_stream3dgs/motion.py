@@ -25,6 +25,8 @@ from gsstream.blocks import approximate_by_cells, enlargement, pixel_size, rows_
 from gsstream_stream3dgs.cache import Cache, Lookup
 
 Setting = pydantic.Field
+#: Cells along an axis of a resolution of the grid, divided by those of the next coarser one.
+GROWTH = 2.0
 #: Share of its views in which a Gaussian must lie in what changed.
 VOTES = 0.75
 #: Quantisation step of the network's weights.
@@ -52,7 +54,6 @@ class CacheMotion(MotionPart):
         entries: int = Setting(default=15, ge=4, le=20, description="log2 of the entries of a resolution")
         features: int = Setting(default=4, ge=1, le=8, description="numbers of an entry")
         base: int = Setting(default=16, ge=2, le=1024, description="cells along an axis at the coarsest resolution")
-        growth: float = Setting(default=2.0, ge=1, le=4, description="ratio from one resolution to the next")
         width: int = Setting(default=64, ge=4, le=128, description="neurons of each of the two hidden layers")
         lr: float = Setting(default=2e-3, gt=0, le=1, description="Adam learning rate of all weights")
         reach: float = Setting(
@@ -118,7 +119,7 @@ class CacheMotion(MotionPart):
             entries=config.entries,
             features=config.features,
             base=config.base,
-            growth=float(np.float32(config.growth)),
+            growth=GROWTH,
             width=config.width,
             layers=2,
             seed=rng.key("stream3dgs", 0) & 0xFFFFFFFF,

@@ -72,7 +72,7 @@ def __dir__() -> list[str]:
 
 
 class Parts(TypedDict, total=False):
-    """Parts by slot: a live one, or the name of one, which takes its settings from ``settings``."""
+    """Slot -> part: a part that was made already, or the name of a part, made from its values in ``settings``."""
 
     structure: Structure | str
     confidence: ConfidenceEstimator | str

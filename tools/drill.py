@@ -5,8 +5,8 @@ Usage: python -m tools.drill --source demo --fps 7.5 --frames 60 --out DIR [--wa
 
 What follows ``--`` goes to ``gsstream run``. The recording runs there and back again for as many frames as are asked
 for. The capture begins when the run waits for it. Writes DIR/capture (the growing recording), DIR/run (of gsstream run)
-and DIR/drill.json: latency, what the policies did, quality over all later frames, dropped ones too, and what else the
-machine did meanwhile, without which seconds say little.
+and DIR/drill.json. The last holds latency, the frames that each policy dropped or held, the quality of all later frames
+with the dropped ones, and the load of the machine during the run, without which the seconds cannot be judged.
 """
 
 from __future__ import annotations

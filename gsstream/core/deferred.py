@@ -32,8 +32,8 @@ def require(ok: Any, error: Callable[[], Exception]) -> None:
 def deferred_checks(enabled: bool = True) -> Iterator[None]:
     """Put off the checks of numbers on a GPU to the end of this context; with ``enabled`` false, none is put off.
 
-    The first that failed is raised, in the words of the place where it was made. What was computed in between is then
-    wrong, too, and has to be given up.
+    At the end, the error of the first failed check is raised, as the place of the check would have raised it. Results
+    that were computed after this check are wrong, too, and must be given up.
     """
     pending: list[tuple[Any, Callable[[], Exception], Blame]] = []
     token = _PENDING.set(pending if enabled else None)

@@ -21,7 +21,7 @@ class PartConfig(BaseModel):
 class Traits:
     """What a part claims about itself. Each kind that has claims extends this record in its own room (``GateTraits``).
 
-    The contract kit checks every claim that is made, and counts the checks of those that are not as skipped.
+    The contract kit runs the checks of each claimed trait; the checks of other traits are reported as skipped.
     """
 
 

@@ -38,7 +38,7 @@ class ProgressDisplay:
     Work that ends before the first line is due prints nothing.
     """
 
-    #: When others were closed last, and when they had printed last.
+    #: Times, by the clock, at which an earlier display was closed last and had printed its last line.
     _before: ClassVar[tuple[float, float]] = (-1.0, -1.0)
 
     def __init__(self, quiet: bool, clock: Callable[[], float] = time.monotonic) -> None:

@@ -29,7 +29,7 @@ def encode_empty(*, frame: int) -> EncodedPacket:
     return build_packet(PacketKind.EMPTY, frame, [])
 
 
-#: Motions and the section that :func:`encode_motions` made of them.
+#: Cache of :func:`encode_motions`: the motions of a packet, and the sections that they were encoded to.
 KnownMotions = tuple[tuple[Motion, ...], list[tuple[str, bytes]]]
 
 

@@ -30,8 +30,10 @@ class Check:
 
     name: str  # name of the function; stable, because expected failures are given by it
     kind: str  # "common", a kind of part, "source", "method", "packet" or "command"
-    kinds: tuple[str, ...]  # kinds of part it is made on
-    trait: str | None  # the claim (a field of the kind's ``Traits``) that calls for it; None: every part of these kinds
+    kinds: tuple[str, ...]  # kinds of part that the check is made on
+    trait: (
+        str | None
+    )  # only parts that claim this field of their ``Traits`` are checked; None: every part
     function: Callable[..., None]  # raises AssertionError with numbers
 
     @property
@@ -46,7 +48,7 @@ CHECKS: dict[str, Check] = {}
 def check(kind: str, trait: str | None = None, kinds: tuple[str, ...] | None = None) -> Callable[..., Any]:
     """Register a function ``check_*(subject)`` of a kind, for parts that claim a ``trait`` (None: all).
 
-    ``kinds``: of part it is made on; None: ``kind`` alone.
+    ``kinds``: kinds of part that the check is made on; None: only ``kind``.
     """
 
     def register(function: CheckFunction) -> CheckFunction:

@@ -33,8 +33,8 @@ UNSET = {
     "renderer/gsplat": "device",
     "renderer/reference": "rows_per_pass",
     "streaming_method/queen": "means.policy means.step quats.policy quats.latent quats.lr scales.policy "
-        "scales.latent scales.lr opacities.policy opacities.latent opacities.lr sh0.policy sh0.latent sh0.lr shN.latent shN.lr "
-        "gate.temperature gate.lr gate.l0 mask.share growth.every growth.start growth.stop "
+        "scales.latent scales.lr opacities.policy opacities.latent opacities.lr sh0.policy sh0.latent sh0.lr "
+        "shN.latent shN.lr gate.temperature gate.lr gate.l0 mask.share growth.every growth.start growth.stop "
         "growth.grad_threshold growth.max_added growth.prune_opacity change.loss change.aggregate "
         "change.dynamic sigma rate",
     # Frame 0 of another stream is taken over as it is where these are equal in both recipes.

@@ -70,7 +70,7 @@ def _ints(low: int, high: int) -> Draw:
     return lambda rng: int(rng.integers(low, high + 1))
 
 
-#: Always drawn: what keeps a run short.
+#: Settings that are drawn for every run; they keep the run short.
 SHORT: Mapping[str, Draw] = MappingProxyType(
     {
         "seed": _ints(0, 10**6),

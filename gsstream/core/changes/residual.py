@@ -1,4 +1,4 @@
-"""Residual: rows behind open gates change by coded symbols, attribute by attribute (S2GS, and whatever sends rows)."""
+"""Residual: quantised changes of the attributes of Gaussians whose gate is open."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ from gsstream.recipe.model import ComponentRef, Recipe
 from gsstream.spec import ComponentSpec
 
 SLOTS = (*METHOD_SLOTS, "streaming_method", "renderer")
-#: Everything that is called behind a guard.
+#: Slots whose parts are called through a guard, which names the part in the errors that the part raises.
 GUARDED = (*SLOTS, "loss", "optimiser")
 #: The loss and the optimiser that are compiled for the processor, and those in torch, which work on any device.
 COMPILED, REFERENCE = "cpu", "reference"

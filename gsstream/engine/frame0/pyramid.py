@@ -81,7 +81,7 @@ def one_size(iterations: int, settings: FirstFrame) -> Pyramid:
 def plan_pyramid(width: int, iterations: int, settings: FirstFrame) -> Pyramid:
     """Return the schedule for pictures of this width: up to three levels, the coarsest at least 320 pixels wide.
 
-    ``iterations`` are those that pictures of one size would take. Where they are few there is one level.
+    ``iterations``: number that pictures of one size would take. Too few iterations for several levels give one level.
     """
     count = min(len(RATES), 1 + max(0, int(math.log2(width / WIDTH)))) if settings.coarse_to_fine else 1
     shares = [round(share * iterations) for share in SHARES[count]]

@@ -22,7 +22,7 @@ DROPOUT = 0.2
 #: stand in, whose walls are smooth but placed too badly by fewer; fewer than that where they look from one side, and
 #: more of them tell depth better than smoothness does.
 SMOOTHNESS, SMOOTHNESS_CAMERAS = 1.0, 6
-#: It takes part in one of so many iterations, after this share of them: at the start no depth is worth keeping.
+#: Smoothness counts in every second iteration, after a tenth of all: at the start no depth is worth keeping.
 SMOOTHNESS_EVERY, SMOOTHNESS_FROM = 2, 0.1
 #: Largest opacity of a Gaussian that stands in for those that are left out.
 MOST_OPAQUE = 0.9999

@@ -175,7 +175,7 @@ class EngineContext:
         return self.session.loss_and_grad(view, target, wrt)
 
     def view_target(self, view: int, tile_weights: torch.Tensor | None = None) -> ViewTarget:
-        self._assembly.where.count()  # a target is asked for once in every iteration
+        self._assembly.where.count()  # counts iterations: each iteration asks for one target
         return self.photometric.view_target(view, tile_weights)
 
     def changed_target(self, view: int, far: float = 0.0) -> ViewTarget:

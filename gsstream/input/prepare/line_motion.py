@@ -16,7 +16,7 @@ from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.input.prepare.picture_checks import Thumbnails
 from gsstream.metrics.noise import noise_sigma
 
-#: Planes through a baseline, over the angle that both cameras see of them.
+#: Number of epipolar planes per pair of cameras, spread over the angles that both cameras see.
 PLANES = 48
 #: Changes count above this many levels and above this many standard deviations of noise; large ones count no more.
 LEVELS, SIGMAS, LARGE = 8 / 255, 6.0, 0.3

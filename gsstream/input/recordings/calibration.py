@@ -21,7 +21,8 @@ from gsstream.input.recordings.distortion import Lens
 from gsstream.input.recordings.rigs.camera import opencv_lens
 
 SCHEMA = "opencv-multiview-1"
-#: Beyond these a file describes no recording; checked before anything is allocated or opened.
+#: Largest picture side, number of frames, and lengths of a text and of a pattern that a file may state. They are
+#: checked before any memory is allocated and any file is opened.
 MAX_SIDE, MAX_FRAMES, MAX_TEXT, MAX_PATTERN = 1 << 16, 10_000_000, 1 << 20, 1000
 CALIBRATION_FILE = "cameras.json"
 

@@ -36,7 +36,7 @@ def to_file_coordinates(source: Source) -> Source:
 
 
 class CanonicalSource(Wrapped):
-    """A source over another one: the same images, with cameras and points in the coordinates of a world.
+    """A source over another one: the same images, with cameras and points in canonical coordinates.
 
     ``info.world`` leads back. Thread-safe when the inner source is.
     """

@@ -68,7 +68,7 @@ def changed_rows(
         means: [N, 3] centres of the session's scene.
         session: asked which Gaussians are visible in which tiles.
         min_votes: 0 to 1.
-        book: votes of this change that are known from other scenes of the frame; None: of none.
+        book: cache of the votes that other scenes of this frame have counted; None: nothing is cached.
     """
     if change is None:
         return means.new_ones(len(means), dtype=torch.bool)

@@ -2,7 +2,8 @@
 
 ``size``, ``matrix`` (pixels, origin at the centre of the first pixel), ``distortions`` (OpenCV's order, four with
 ``fisheye``), ``rotation`` (a vector, or 3 x 3) and ``translation``: world to camera, OpenCV axes, units of the
-board. The camera is called ``name``; without one, ``cam_ID`` (Caliscope's ``cam_id`` or ``port``), else as its table.
+board. The camera has the name in ``name``, else ``cam_ID`` of Caliscope's ``cam_id`` or
+``port``, else the name of its table.
 """
 
 from __future__ import annotations

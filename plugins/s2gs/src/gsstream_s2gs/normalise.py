@@ -12,7 +12,7 @@ def median(values: torch.Tensor) -> torch.Tensor:
 
 
 def robust(values: torch.Tensor, epsilon: float, relative: bool, limit: float) -> torch.Tensor:
-    """(m - median) / (MAD + eps) (paper). Without any spread and eps = 0 the sign of the deviation times ``limit``."""
+    """(m - median) / (MAD + eps) (paper). If the MAD and eps are 0: sign(deviation) * limit."""
     center = median(values)
     spread = median((values - center).abs())
     scale = spread + (epsilon * (center + spread) if relative else epsilon)

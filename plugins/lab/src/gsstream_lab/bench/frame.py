@@ -78,7 +78,7 @@ class _Ball:
     radius: float
 
     def holds(self, scene: Gaussians[FloatArray]) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-        """[N] bool."""
+        """Return [N] bool: rows inside the ball."""
         distance = np.linalg.norm(scene.means - np.asarray(self.center, np.float32), axis=1)
         return np.asarray(distance < self.radius)
 

@@ -37,7 +37,7 @@ class Equal:
     ] = None
 
     def numbers(self) -> tuple[list[int], list[float]]:
-        """Return what --epochs and --seconds say. Raises InputError for one that means nothing here."""
+        """Parse --epochs and --seconds to lists of numbers. Raises InputError for an option without meaning here."""
         for option, text, where in (("--epochs", self.epochs, "epochs"), ("--seconds", self.seconds, "time")):
             if text is not None and self.at != where:
                 raise InputError(f"{option} {text} belongs to --at {where}, got --at {self.at}")

@@ -241,7 +241,7 @@ def encoder_for_rig(
 
 
 def _assembled(method: str, settings: Mapping[str, Any] | None, parts: Parts) -> Assembly:
-    """The live parts of a method's recipe; ``parts`` replace those of the same slot."""
+    """Return the assembled parts of a method's recipe; each of ``parts`` replaces the part of its slot."""
     given: dict[str, Any] = dict(parts)
     unknown = sorted(given.keys() - Parts.__annotations__.keys())
     if unknown:

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     Kind = str
 else:
     Kind = Literal[tuple(PART_KINDS)]
-#: What a name in a listing may belong to: a kind of part, a named method (a recipe), or a command.
+#: Kinds of declarations that a listing names: a kind of part, a named method (a recipe), or a command.
 KINDS: tuple[str, ...] = (*PART_KINDS, "method", "command")
 
 hookspec = pluggy.HookspecMarker("gsstream")

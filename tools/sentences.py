@@ -35,7 +35,7 @@ class Sentence(NamedTuple):
 
 def sentences_of(text: str) -> Iterator[str]:
     """Split prose into sentences of at least six words; a paragraph or an item of a list ends a sentence, too."""
-    for block in re.split(r"\n\s*\n|\n\s*(?=[-*] |\d+\. |\|)", text):
+    for block in re.split(r"\n\s*\n|\n\s*(?=[-*] |\d+\. |\||[a-z_]+(?:, [a-z_]+)*: )", text):
         for sentence in re.split(r"(?<=[.!?])\s+(?=[A-Z`*\"'(])", " ".join(block.split())):
             if len(sentence.split()) >= WORDS:
                 yield sentence

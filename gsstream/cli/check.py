@@ -64,7 +64,7 @@ def check(
 
 
 def _lines(subject: Subject, quiet: bool) -> Iterator[str]:
-    """Yield a line per check; checks of one reason share one; ``quiet`` leaves out what passed or is not claimed."""
+    """Yield a line per check; checks of one reason share a line; ``quiet`` leaves out passed and unclaimed checks."""
     if subject.absent:
         yield _line(subject.results[0], "every check")
         return

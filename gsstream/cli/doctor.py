@@ -27,7 +27,7 @@ from gsstream.core.processors import processors
 if TYPE_CHECKING:
     from gsstream.player.render import PlayerRenderer
 
-#: What the kernels ask a processor for, as Linux spells it.
+#: Instruction sets that the kernels use where a processor has them, by the names that Linux gives them.
 _FLAGS = ("sse4_2", "avx2", "fma", "avx512f", "asimd")
 #: Levels of 255 by which two renderers may differ in one pixel.
 _LEVELS = 2
@@ -87,7 +87,7 @@ def _player() -> tuple[PlayerRenderer, str]:
 
 
 def _instructions(name: str) -> str:
-    """What a compiled renderer says of itself where it offers to be measured (entry point group ``gsstream.bench``)."""
+    """Return instruction set and threads of a compiled renderer with an entry point in the group ``gsstream.bench``."""
     for point in importlib.metadata.entry_points(group="gsstream.bench", name=name):
         try:
             native = point.load()
@@ -128,7 +128,7 @@ def _encoder() -> str:
 
 
 def _gpu() -> str:
-    """What the driver and torch know; whether it is used, the line on the encoder says."""
+    """Return a line about the GPU as the driver and torch report it; the encoder's line says whether it is used."""
     torch = sys.modules.get("torch")
     found, seen = "", torch is not None and torch.cuda.is_available()
     if shutil.which("nvidia-smi"):
@@ -157,7 +157,7 @@ def _plugins() -> str:
 
 
 def _extras() -> Iterator[tuple[str, str]]:
-    """Each extra of gsstream but the developer's, and what it lacks."""
+    """Yield each extra of gsstream but the developer's, and its packages that are not installed."""
     about = importlib.metadata.metadata("gsstream")
     wanted: dict[str, list[str]] = {extra: [] for extra in about.get_all("Provides-Extra") or () if extra != "dev"}
     for line in importlib.metadata.requires("gsstream") or ():
@@ -184,7 +184,7 @@ def _missing(extra: str, wanted: dict[str, list[str]]) -> Iterator[str]:
 
 
 def _self_test(renderer: PlayerRenderer) -> tuple[bool, str]:
-    """Write, read and draw a small scene; the picture must be that of the renderer in numpy."""
+    """Write, read and draw a small scene; the picture must equal the picture of the renderer in numpy."""
     import numpy as np
 
     from gsstream.core.cameras import Cameras

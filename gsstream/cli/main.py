@@ -26,7 +26,7 @@ _LINE = "\n"
 
 @dataclass
 class GlobalOptions:
-    """What the options before the command's name say."""
+    """Values of the options before the command's name."""
 
     debug: bool = False
 

@@ -1,4 +1,4 @@
-"""``gsstream methods``: what --method may name."""
+"""``gsstream methods``: the methods that --method takes."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ def server_beside(out: Path, port: int | None) -> Server | None:
 
 @contextmanager
 def serving(server: Server | None) -> Iterator[None]:
-    """Serve meanwhile, and say where."""
+    """Serve the run while it goes on, and print the address."""
     if server is None:
         yield
         return

@@ -33,7 +33,7 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="Print only warnings and er
 
 @dataclass(frozen=True)
 class RecipeOptions:
-    """Which recipe, and what is changed of it."""
+    """The recipe of a command line, and the settings that the command line changes."""
 
     method: Annotated[
         str | None, typer.Option("--method", help="Method (see 'gsstream methods'); by default the recipe file's.")
@@ -65,12 +65,12 @@ class ShownOptions:
     quiet: Quiet = False
 
     def wanted(self) -> dict[str, bool]:
-        """Return what ``write_gallery`` is asked for."""
+        """Return the arguments of ``write_gallery``."""
         return {"pictures": not self.no_pictures, "video": not self.no_video}
 
 
 def overrides(settings: Sequence[str] | None, *, budget: str | None = None, **short: object) -> list[tuple[str, str]]:
-    """Return what a command line changes in a recipe: (option, KEY.PATH=VALUE), the short options last.
+    """Return the changes of a recipe on a command line as (option, KEY.PATH=VALUE), those of short options last.
 
     ``short``: recipe key -> value of an option of that name; None: not given.
     """

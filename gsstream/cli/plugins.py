@@ -1,4 +1,4 @@
-"""``gsstream plugins``: every plugin and part, healthy or quarantined, and what a part can be told."""
+"""``gsstream plugins``: every plugin and part, healthy or quarantined, and the settings of a part."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def _schema(method: str | None, catalog: Catalog) -> str:
 
 
 def _part_schemas(catalog: Catalog) -> dict[str, dict[str, PartSchema]]:
-    """Every part that a recipe may name, imported; those that cannot be are named without their settings."""
+    """Import every part that a recipe may name; parts whose import fails are listed without their settings."""
     from gsstream.recipe.schema import PartSchema, slots
 
     found: dict[str, dict[str, PartSchema]] = {slot: {} for slot in slots()}

@@ -94,7 +94,7 @@ def run(
 
 
 def _note(line: str) -> None:
-    """Print a note; nothing where there is nothing to say."""
+    """Print a note; print nothing for an empty note."""
     if line:
         typer.echo(f"note: {line}", err=True)
 
@@ -134,7 +134,7 @@ def meant_for(uri: str) -> str | None:
 
 
 def _proposed(source: str, given: Sequence[Path]) -> str:
-    """The line that names the recipe which is meant for a recording; nothing where it is among those given."""
+    """Return a line that names the recipe made for a recording; empty where the command line gives this recipe."""
     from gsstream.recipe.shipped import SCHEME, recipe_file
 
     name = meant_for(source)
@@ -192,7 +192,7 @@ def _what_there_is(error: GsstreamError, out: Path, recording: Source, wanted: M
 
 
 def _pictures(result: RunResult, recording: Source, wanted: Mapping[str, bool], quiet: bool, warned: bool) -> None:
-    """Contact sheet, plots, summary and video; ``warned``: the run has said that nothing fast renders here."""
+    """Contact sheet, plots, summary and video; ``warned``: the run has printed that no fast renderer is installed."""
     from gsstream.evaluation.gallery import SUMMARY, write_gallery
     from gsstream.player.render import SlowRendererWarning
 

@@ -16,7 +16,7 @@ from gsstream.core.kinds import PART_KINDS
 
 #: Kinds that a plugin can start from.
 STARTABLE = tuple(name for name, kind in PART_KINDS.items() if kind.use is not None)
-#: What the contract test checks: a part, or of a source the recording that it opens.
+#: Expression of the subject of the contract test: a part, or the recording that a source opens.
 SUBJECTS: Mapping[str, str] = {"source": 'SourceUnderTest(<cls>, "<name>:")'}
 
 
@@ -76,7 +76,7 @@ def _fill(text: str, values: Mapping[str, str]) -> str:
     return re.sub(r"<(\w+)>", lambda match: values[match[1]], text)
 
 
-#: What the README says about checks, by kind.
+#: Kind -> sentence of the README about its checks.
 CLAIMS: Mapping[str, str] = {
     "": "A claim in `traits` is a promise that is checked;\nwhat is not claimed is skipped.",
     "source": "Another recording:\n`gsstream check source/NAME --source NAME:PLACE`.",

@@ -1,4 +1,4 @@
-"""``gsstream scene``: make a scene from raw recordings, and say what is wrong with one."""
+"""``gsstream scene``: make a scene from raw recordings, and find faults of a scene."""
 
 from __future__ import annotations
 

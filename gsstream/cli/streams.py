@@ -87,7 +87,7 @@ def play(
 
 
 def stream_file(path: Path) -> Path:
-    """Return the stream file meant by ``path``. Raises InputError when there is none, naming what was looked for."""
+    """Return the stream file meant by ``path``. Raises InputError that names the path when there is none."""
     file = path / "stream.gss" if path.is_dir() else path
     if not file.is_file():
         raise InputError(f"no stream at {file}: expected a .gss file or the output folder of a run")
@@ -142,7 +142,7 @@ def check_recipe(file: Path, recipe: Mapping[str, Any]) -> None:
 
 
 def fail_with(damage: PacketError | None) -> None:
-    """Raise what ended a stream early, once the frames before it are done: exit code 1 and the byte of the damage."""
+    """Raise the error that ends a damaged stream, after its sound frames are done: exit code 1, byte of the damage."""
     if damage is not None:
         raise damage
 

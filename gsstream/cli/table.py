@@ -55,7 +55,7 @@ class CommandTable(TyperGroup):
         """Find the command of a line; a name that is not one is answered with the nearest that is."""
         if args and args[0] not in self._own and self.get_command(ctx, args[0]) is None:
             names = [*self._own, *self._others()]
-            # What typer suggests from: the names alone, none of which is imported for that.
+            # Typer suggests similar commands from these names; no command is imported for the suggestion.
             self.commands.update({name: TyperCommand(name) for name in names if name not in self.commands})
         return super().resolve_command(ctx, args)
 

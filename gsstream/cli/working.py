@@ -1,4 +1,4 @@
-"""What a command shows while it works, and how it ends when it is told to."""
+"""Progress of a command on the terminal, and its end by a signal."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gsstream.core.progress import ProgressDisplay
 
 @contextmanager
 def working(what: str, quiet: bool = False) -> Iterator[ProgressDisplay]:
-    """Show what is worked at; Ctrl-C, SIGTERM and SIGHUP end it at once, and temporary files go."""
+    """Show the work of a command; Ctrl-C, SIGTERM and SIGHUP end the command at once and remove its temporary files."""
     from gsstream.engine.run.output import ended_by_signals
 
     with ended_by_signals() as came, ProgressDisplay(quiet) as display:

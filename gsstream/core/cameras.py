@@ -106,7 +106,7 @@ class Cameras:
 
 
 def _check_pinhole(name: str, viewmat: FloatArray, K: FloatArray) -> None:
-    """What renderers never read must be what they take it for."""
+    """Raise ShapeError unless the matrices are those of a pinhole camera without skew: no renderer reads skew."""
     # Calibrations written with rounding carry a skew of a millionth; it moves no pixel by as much.
     if abs(K[0, 1]) > 1e-6 * K[0, 0] or abs(K[1, 0]) > 1e-6 * K[1, 1]:
         raise ShapeError(

@@ -49,10 +49,10 @@ class FrameContext(Protocol):
         """The V training cameras."""
 
     def image(self, view: int) -> torch.Tensor:
-        """Return [H, W, 3]: what a camera recorded in frame t, in [0, 1]."""
+        """Return the image [H, W, 3] of a camera in frame t, in [0, 1]."""
 
     def previous_image(self, view: int) -> torch.Tensor:
-        """Return [H, W, 3]: what a camera recorded in the frame that ``gaussians`` shows, in [0, 1]."""
+        """Return the image [H, W, 3] of a camera in the frame that ``gaussians`` shows, in [0, 1]."""
 
     def image_change(self, view: int) -> torch.Tensor:
         """Return [H, W, 3]: ``image`` minus ``previous_image`` in the tiles that changed, and 0 in the others."""
@@ -64,7 +64,7 @@ class FrameContext(Protocol):
         """Backpropagate an upstream gradient [H, W, 3] to the 2-D means of ``gaussians`` in one backward pass."""
 
     def screen_gradient_rows(self, view: int, image_gradient: torch.Tensor) -> RowGradient:
-        """Return what :meth:`screen_gradient` does of the rows that it reaches, without arrays of all N rows."""
+        """Return the rows that :meth:`screen_gradient` reaches, and their gradients, without arrays of N rows."""
 
     def noise_sigma(self, view: int) -> float:
         """Return the robust standard deviation of a camera's noise between two frames, in [0, 1] image units."""

@@ -50,7 +50,7 @@ def deferred_checks(enabled: bool = True) -> Iterator[None]:
 
 @contextmanager
 def blaming(blame: Callable[[], Blame]) -> Iterator[None]:
-    """Say in this context who is to blame for a check that is put off. ``blame()`` is asked when the check is made."""
+    """Within this context, errors of deferred checks pass through the function that ``blame()`` returns."""
     token = _BLAME.set(blame)
     try:
         yield

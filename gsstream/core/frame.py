@@ -50,7 +50,7 @@ class Frame:
     arrival: Arrival | None = None
 
     def image(self, view: int) -> FloatArray:
-        """Return [H, W, 3] float32 in [0, 1]: what a camera recorded."""
+        """Return the image [H, W, 3] of a camera, float32 in [0, 1]."""
         return unpacked(self.images[view])
 
     def as_float32(self) -> Frame:

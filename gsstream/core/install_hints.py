@@ -15,7 +15,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-#: What only the extra ``encoder`` brings: everything that imports one of these encodes, measures or plots.
+#: Packages of the extra ``encoder`` alone: modules that import one of them encode, measure or plot.
 ENCODER = ("torch", "kornia", "scipy", "matplotlib")
 #: Extra -> the parts, methods and commands of this project's other distributions that it brings, as "KIND/NAME".
 #: ``python -m tools.shipped`` writes it from what the plugins declare.
@@ -100,7 +100,7 @@ def install_part(kind: str, name: str) -> str | None:
 
 
 def install_renderer() -> str:
-    """Return what installs the compiled renderer: its sources where these are at hand, else its distribution."""
+    """Return pip's argument for the compiled renderer: its folder in a checkout, else its distribution."""
     sources = SOURCES / "plugins" / "cpu_render"
     if (sources / "pyproject.toml").is_file():
         return f"install a C++20 compiler, then: {install(str(sources))}"
@@ -122,7 +122,7 @@ def require_encoder() -> None:
 
 
 def missing_for_encoding(error: ModuleNotFoundError) -> str | None:
-    """Return what to say when a package of the extra ``encoder`` is missing; None when it is any other package."""
+    """Return the message about a missing package of the extra ``encoder``; None for any other package."""
     package = (error.name or "").partition(".")[0]
     if package not in ENCODER:
         return None

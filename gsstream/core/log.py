@@ -90,7 +90,7 @@ class FrameLog:
         return time.perf_counter() - self._started
 
     def seconds(self, *phases: str) -> float:
-        """Return the seconds of these phases, what stands below them included."""
+        """Return the seconds of these phases, their inner phases included."""
         return sum(took for name, took in self._phases.items() if name.partition("/")[0] in phases)
 
     @property

@@ -10,7 +10,7 @@ from gsstream.core.shapes import FloatArray
 
 
 def median(values: FloatArray) -> np.floating[Any]:
-    """Return what ``np.median`` does, to the bit, NaN included, in a quarter of its time.
+    """Return the result of ``np.median``, to the bit, NaN included, in a quarter of its time.
 
     A partition around one place takes numpy's quick way; ``np.median`` asks for three places at once.
     """

@@ -29,7 +29,7 @@ def check_camera_ids(ids: Iterable[str]) -> None:
 
 
 def name_fault(name: str) -> str | None:
-    """Say, as a clause, what keeps a text from being the name of one file or folder; None: nothing does."""
+    """Return, as a clause, why a text cannot be the name of one file or folder; None: it can."""
     if not name:
         return "it is empty"
     if name in (".", ".."):

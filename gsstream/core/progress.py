@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-#: What is done, how much of it, and of how much: 0 where that is not known.
+#: Name of the work, number of its steps that are done, and of all its steps; 0 where the number is unknown.
 Tell = Callable[[str, int, int], None]
 #: Seconds after which a line is printed though nothing has changed. With the time that it takes to wake up, no more
 #: than five seconds lie between two lines.
@@ -88,7 +88,7 @@ class ProgressDisplay:
             self._thread.join()
 
     def tell(self, what: str, done: int = 0, total: int = 0, note: str = "") -> None:
-        """Go on to ``what``, or on with it; lines are printed when they are due."""
+        """Show ``what`` as the present work, with ``done`` of ``total`` steps; a line is printed when it is due."""
         with self._lock:
             now, new = self._clock(), what != self._what
             if new:
@@ -113,7 +113,7 @@ class ProgressDisplay:
         return gone / (self._done - self._first) * (self._total - self._done)
 
     def line(self) -> str:
-        """Return what is done now, in one line."""
+        """Return the present work in one line."""
         parts = [f"{self._what} {self._done}/{self._total}" if self._total else self._what]
         parts += [self._note] if self._note else []
         waited, left = self._clock() - self._changed, self.left()

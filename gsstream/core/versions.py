@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-#: What helps against something that was written for an older major version.
+#: Cure for plugins and files that were written for an older major version.
 NEWER_PLUGIN = "ask its author for a newer version"
 NEWER_RECIPE = "write its keys as 'gsstream recipe METHOD' shows them, and set schema_version to that number"
 

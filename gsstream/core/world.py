@@ -62,7 +62,7 @@ class World:
         return bool(apart <= 1e-6 * self.scale + 1e-12 * np.abs(self.offset).max())
 
     def validate(self) -> None:
-        """Raise ShapeError for what is not a similarity of finite numbers."""
+        """Raise ShapeError unless this is a similarity of finite numbers."""
         if len(self.rotation) != 9 or len(self.offset) != 3:
             raise ShapeError(f"world: expected 9 and 3 numbers, got {len(self.rotation)} and {len(self.offset)}")
         if not np.isfinite([*self.rotation, *self.offset, self.scale]).all() or self.scale <= 0:
@@ -73,8 +73,8 @@ class World:
 
     def inverse(self) -> World:
         """Return the similarity the other way."""
-        turned = self.matrix.T
-        return _world(turned, -turned @ np.array(self.offset) / self.scale, 1 / self.scale)
+        rotated = self.matrix.T
+        return _world(rotated, -rotated @ np.array(self.offset) / self.scale, 1 / self.scale)
 
     def after(self, first: World) -> World:
         """Return the similarity that does ``first``, then this one."""
@@ -123,7 +123,7 @@ IDENTITY = World()
 
 
 def rig_similarity(rig: Cameras, points: Callable[[], PointCloud | None] = lambda: None) -> World:
-    """Return the world that a rig defines for itself: the same, up to rounding, however the rig is moved or turned.
+    """Return the world that a rig defines for itself: the same, up to rounding, however the rig is moved or rotated.
 
     Its origin is the mean of the camera centres. One unit is the rig's extent; cameras that all stand in one place have
     none, then it is their median distance to ``points``, then the recording's own unit. The z axis points up
@@ -152,7 +152,7 @@ def rig_similarity(rig: Cameras, points: Callable[[], PointCloud | None] = lambd
 
 
 def snap_cameras(rig: Cameras) -> Cameras:
-    """Return cameras whose poses are rounded to ``GRID``; what was a rotation is one still."""
+    """Return cameras whose poses are rounded to ``GRID``; rotations stay rotations."""
     viewmats = np.rint(rig.viewmats / GRID) * GRID + 0.0
     rotations = viewmats[:, :3, :3]
     error = np.einsum("cji,cjk->cik", rotations, rotations) - np.eye(3)

@@ -1,4 +1,4 @@
-"""The catalogue: names -> specs, lazily resolved; what could not be loaded stays visible in quarantine."""
+"""The catalogue: names -> specs, lazily resolved; plugins that could not be loaded stay visible in quarantine."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class Catalog:
 
 
 def load_catalog(plugins: Iterable[Discovered] | None = None) -> Catalog:
-    """Discover plugins (or take ``plugins``) and index what they declare.
+    """Discover plugins (or take ``plugins``) and index their declarations.
 
     A plugin that declares a name already taken is refused as a whole; the built-in parts come first, then
     distributions in alphabetical order.

@@ -13,7 +13,7 @@ from gsstream.spec import CommandSpec
 
 
 def command_of(spec: CommandSpec, catalog: Catalog) -> Any:
-    """Import what a declaration names and make a command of it.
+    """Import the function that a declaration names, and make a command of it.
 
     Raises PluginUnavailable when it cannot be imported, or typer can make nothing of its parameters.
     """

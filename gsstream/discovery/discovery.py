@@ -57,7 +57,7 @@ class Discovered:
 
     @property
     def reason(self) -> str:
-        """The error in one line, with its type where the message alone would not say it."""
+        """Return the error in one line, with its type unless the message names the fault by itself."""
         if self.error is None:
             return ""
         text = textwrap.shorten(_message(self.error) or "no message", 400, placeholder=" ...")
@@ -123,7 +123,7 @@ def _inspect(name: str, distribution: str, version: str, load: Any) -> Discovere
 
 
 def _warn_slow(name: str, distribution: str) -> None:
-    """A plugin that hangs at import takes everything with it; so its name is said while it does."""
+    """Print the name of a plugin whose import takes long: a plugin that hangs stops the whole program."""
     print(
         f"gsstream: the plugin {name!r} (from {distribution}) has been loading for {SLOW:g} seconds; "
         "GSSTREAM_LOAD_PLUGINS=OTHER,NAMES leaves it out",
@@ -133,7 +133,7 @@ def _warn_slow(name: str, distribution: str) -> None:
 
 
 def _message(error: BaseException) -> str:
-    """What an error says, in characters that can be printed; a plugin's own class may fail even at that."""
+    """Return the text of an error in printable characters; the ``__str__`` of a plugin's error may raise, too."""
     if isinstance(error, pydantic.ValidationError):
         wrong = (f"{'.'.join(map(str, w['loc']))}: {w['msg']}, got {w['input']!r}" for w in error.errors())
         return f"{error.title} of component API {API_VERSION}: {'; '.join(wrong)}"

@@ -1,4 +1,4 @@
-"""Contact sheet: frames side by side; ground truth, decoded, error and what was allowed to change below each other.
+"""Contact sheet: frames side by side; below each other ground truth, decoded image, error and changed Gaussians.
 
 Below them, close up, what changed most since the first frame: ground truth, decoded, and the fresh reconstruction of
 the frame where there is one.
@@ -189,7 +189,7 @@ def _alone(path: Path, frame: int, rig: Cameras, renderer: PlayerRenderer | None
 
 
 def paint_gates(state: PlayerState) -> Gaussians[FloatArray]:
-    """Return the scene in two colours: orange what the frame moved or let change, by gate value, grey the rest."""
+    """Return the scene in two colours: Gaussians that the frame changed are orange by gate value, others grey."""
     gaussians = state.gaussians
     share: FloatArray = np.zeros(len(gaussians), np.float32)
     if state.delta is not None and state.before is not None:

@@ -1,4 +1,4 @@
-"""Quality of decoded frames: what the player shows, against the recording, and against showing frame 0 for ever."""
+"""Quality of decoded frames: the player's images against the recording, beside those of frame 0 shown for ever."""
 
 from __future__ import annotations
 
@@ -271,7 +271,7 @@ def _compare(
 def _with_seen(
     quality: ViewQuality, pair: ViewPair, held: FloatArray, changed: BoolArray, seen: BoolArray
 ) -> ViewQuality:
-    """The same with what is measured on the pixels that training cameras see."""
+    """Return these numbers together with those on the pixels that training cameras see."""
     image, truth = pair.image, pair.truth
     return replace(
         quality,

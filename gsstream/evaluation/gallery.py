@@ -24,7 +24,7 @@ NO_FILES: Mapping[int, Path] = MappingProxyType({})
 
 
 def write_gallery(out: Path, source: Source, *, pictures: bool = True, video: bool = True) -> list[Path]:
-    """Write the summary and every picture a person would look for first; return what was written."""
+    """Write the summary and every picture a person would look for first; return the files that were written."""
     with Playback(out / STREAM) as playback:
         frames, meta = playback.frames, playback.meta
     records = read_records(out / METRICS)

@@ -1,4 +1,4 @@
-"""Published protocols: what a recording has to be so that its numbers stand beside printed ones, and those numbers."""
+"""Published protocols: conditions on a recording for numbers that are comparable to printed ones, and those numbers."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def _numbered(cameras: Sequence[str]) -> list[str]:
 
 
 def protocol_numbers(name: str, evaluation: Evaluation) -> dict[str, Any]:
-    """Return what the protocol reports: means over test cameras and frames, the first included."""
+    """Return the protocol's numbers: means over test cameras and frames, the first included."""
     wanted, frames = find_protocol(name), {view.frame for view in evaluation.views}
     names = ("psnr", "ssim") if evaluation.lpips_variant is None else ("psnr", "ssim", "lpips")
     means = {key: mean(getattr(view, key) for view in evaluation.views) for key in names}

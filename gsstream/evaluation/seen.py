@@ -52,7 +52,7 @@ def seen_masks(
     solid = [np.isfinite(depth) for depth in depths]
     points = [_backproject(cameras, view, depths[view], solid[view]) for view in range(len(cameras))]
     counts = [np.zeros(len(of), np.int32) for of in points]
-    # One depth of a training camera at a time: a large rig's would fill the memory.
+    # The depth of one training camera at a time: the depths of a large rig together would fill the memory.
     for view in range(len(training)):
         depth = draw_depths(scene, training, view, renderer)
         for count, of in zip(counts, points, strict=True):

@@ -202,7 +202,7 @@ def entropy_bits(values: Any) -> float:
 
 
 def float16_bytes(gaussians: Gaussians[FloatArray], names: Sequence[str], rows: IntArray) -> int:
-    """Return the bytes of these rows as float16 by zstandard level 19: what a plain codec would send."""
+    """Return the bytes of these rows as float16 by zstandard level 19, the size of a plain codec's packet."""
     parts = [getattr(gaussians, name)[rows].astype(np.float16).tobytes() for name in names]
     return len(zstandard.ZstdCompressor(level=19).compress(b"".join(parts)))
 

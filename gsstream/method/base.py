@@ -31,7 +31,7 @@ class MethodState(Protocol):
 
     @property
     def player(self) -> PlayerState:
-        """Exactly what every player has after the last packet."""
+        """The state of every player after the last packet, bit by bit."""
 
 
 State = TypeVar("State", bound=MethodState)
@@ -131,5 +131,5 @@ class StreamingMethod(Part, Generic[State]):
 
     @final
     def decoder(self) -> PacketDecoder:
-        """Return what turns packets into scenes: the function every player has, so no stream needs a plugin to play."""
+        """Return the function from packets to scenes that every player has: no stream needs a plugin to play."""
         return decode_packet

@@ -1,4 +1,4 @@
-"""Packets and what every player makes of them, in one call each: a method goes on from the second."""
+"""Packets and the players' state after them, in one call each: a method continues from the players' state."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Sent(NamedTuple):
 
 
 def send_key(gaussians: Gaussians[FloatArray], layout: Layout, meta: StreamMeta, frame: int) -> Sent:
-    """Return a key packet, and what every player has after it. Raises ShapeError when the rows do not fit.
+    """Return a key packet, and the state of every player after it. Raises ShapeError when the rows do not fit.
 
     Arguments:
         gaussians: N rows, raw values, stored node by node.

@@ -15,7 +15,7 @@ from gsstream.packet import PlayerState
 
 @dataclass(frozen=True)
 class StaticState:
-    """Nothing but what the player has."""
+    """The state of the player, and nothing else."""
 
     player: PlayerState
 

@@ -99,7 +99,7 @@ class Tools(Protocol):
         """Show how far the optimisation of frame 0 is."""
 
     def meta(self, frame: Frame) -> StreamMeta:
-        """Return what a key packet of this frame says about the run, and of the scene that players have before it."""
+        """Return the meta of a key packet of this frame: the run, and the scene that players have before it."""
 
     def key_refusal(self, num_gaussians: int) -> str | None:
         """Return why a later key packet of so many Gaussians does not fit the budget now; None: it may be sent."""
@@ -111,7 +111,7 @@ class Tools(Protocol):
         """Return the training images of an earlier frame while a stream is resumed. Raises InputError otherwise."""
 
     def since_key(self) -> Iterator[PlayerState]:
-        """Yield, while a stream is resumed, what players have after each packet since the last key packet, in order."""
+        """Yield, in a resumed run, the players' state after each packet since the last key packet, in order."""
 
     def open(self, player: PlayerState, previous: Frame, frame: Frame) -> FrameTools:
         """Begin work on a frame.

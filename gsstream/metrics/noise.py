@@ -1,4 +1,4 @@
-"""Camera noise, measured between two frames without knowing what moved."""
+"""Camera noise, measured between two frames in which unknown regions moved."""
 
 from __future__ import annotations
 

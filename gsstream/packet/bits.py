@@ -49,7 +49,7 @@ class BitWriter:
 
 
 class BitReader:
-    """Reads what :class:`BitWriter` wrote. Every overrun is a PacketError."""
+    """Reads the bits that :class:`BitWriter` wrote. Every overrun is a PacketError."""
 
     def __init__(self, data: bytes) -> None:
         # A string of digits: str.find and int(text, 2) are the fastest bit scans the standard library has.
@@ -89,7 +89,7 @@ def pack_blobs(blobs: list[bytes]) -> bytes:
 
 
 def unpack_blobs(data: bytes, count: int) -> list[bytes]:
-    """Split what :func:`pack_blobs` joined. Raises PacketError when a length runs past the end."""
+    """Split the bytes that :func:`pack_blobs` joined. Raises PacketError when a length runs past the end."""
     blobs, at = [], 0
     for _ in range(count - 1):
         length, shift = 0, 0
@@ -118,7 +118,7 @@ def _varint(value: int) -> bytes:
     return bytes(out)
 
 
-#: Of zstandard, for text that has no better model.
+#: Level of zstandard, for text that has no better model.
 _LEVEL = 12
 
 
@@ -128,7 +128,7 @@ def compress(data: bytes) -> bytes:
 
 
 def decompress(data: bytes, limit: int) -> bytes:
-    """Return what :func:`compress` was given. The announced size is checked against ``limit`` before allocating."""
+    """Return the argument of :func:`compress`. The announced size is checked against ``limit`` before allocating."""
     try:
         size = zstandard.frame_content_size(data)
         dictionary = zstandard.get_frame_parameters(data).dict_id

@@ -37,7 +37,7 @@ from gsstream.packet.rows import decode_rows, decoded_rows, encode_codes, row_co
 from gsstream.packet.symbols import decode_symbols, encode_symbols
 
 _LAYERS = struct.Struct("<III")
-#: Where the bytes begin that section ``layers``, the first of its packet, tells of.
+#: Offset of the bytes that section ``layers``, the first of its packet, describes.
 _START = PACKET_HEADER.size + SECTION_HEADER.size + _LAYERS.size
 
 #: Sections that the checksum of the first layer covers, and all sections of a packet with layers, in their order.
@@ -64,7 +64,7 @@ def in_layers(
         raise ShapeError(f"first: expected [{len(gaussians)}] bool, got {list(first.shape)} {first.dtype}")
     codes = row_codes(gaussians)
     means = decoded_rows(gaussians, codes).means
-    # Both layers lie on the grids of the whole scene, so that the layers do not show in what is decoded.
+    # Both layers lie on the grids of the whole scene, so that a decoded scene does not depend on the layers.
     floor = floor_exponent(codes["scales"], KEY_BITS["scales"]) if len(means) else None
     now, later = (
         encode_codes(means[rows], {name: table[rows] for name, table in codes.items()}, floor)
@@ -100,7 +100,7 @@ def decode_layers(data: bytes, sections: Mapping[str, Section], number: int, off
 
 
 def first_layer(data: bytes) -> FirstLayer | None:
-    """Return what can be drawn of the beginning of a key packet, or None: not enough is there, or it has no layers.
+    """Return the scene in the beginning of a key packet; None when its first layer is incomplete, or without layers.
 
     Damaged data gives None as well; reading the whole packet raises the error that describes the damage.
     """
@@ -129,7 +129,7 @@ def _first_layer(data: bytes) -> FirstLayer | None:
 
 
 def read_head(data: bytes) -> tuple[int, int, int]:
-    """Return what section ``layers`` says: Gaussians of the first layer, bytes of its sections, their CRC-32."""
+    """Return the contents of section ``layers``: Gaussians of the first layer, bytes of its sections, their CRC-32."""
     if len(data) != _LAYERS.size:
         raise PacketError(f"layers: expected {_LAYERS.size} bytes, got {len(data)}")
     in_first, size, checksum = _LAYERS.unpack(data)

@@ -1,4 +1,4 @@
-"""StreamMeta: what a key packet says about the run, as JSON. What a reader refuses, a writer does not write."""
+"""StreamMeta: the description of the run in a key packet, as JSON. Writers refuse everything that readers refuse."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class StreamMeta:
 
     @property
     def title(self) -> str:
-        """The method, and what was changed of its recipe, as far as the encoder said so."""
+        """The method, and the changed settings of its recipe where the encoder wrote them."""
         return str(self.extra.get("title") or self.method)
 
     def camera(self, name: str) -> Cameras:
@@ -112,7 +112,7 @@ def meta_from_json(data: bytes) -> StreamMeta:
     try:
         if _nested_too_deep(data):
             raise ValueError(f"arrays and objects lie more than {MAX_DEPTH} deep within each other")
-        # As text: of bytes, the parser would guess the encoding.
+        # As text: the parser would guess the encoding of bytes.
         value = _object(json.loads(data.decode("utf-8"), parse_constant=_refuse, parse_float=_finite))
         meta = StreamMeta(
             method=_text(value["method"]),

@@ -50,7 +50,7 @@ def quantise_positions(means: FloatArray, scale_codes: IntArray, bits: int) -> F
 
 
 def encode_positions(means: FloatArray, scale_codes: IntArray, bits: int, floor: int | None = None) -> bytes:
-    """Encode what :func:`quantise_positions` returned; the reader knows N and the scales."""
+    """Encode the codes that :func:`quantise_positions` returned; the reader knows N and the scales."""
     if len(means) == 0:
         return b""
     floor = floor_exponent(scale_codes, bits) if floor is None else floor
@@ -65,7 +65,7 @@ def encode_positions(means: FloatArray, scale_codes: IntArray, bits: int, floor:
 
 
 def decode_positions(data: bytes, scale_codes: IntArray, bits: int) -> FloatArray:
-    """Decode what :func:`encode_positions` wrote. Raises PacketError (without offset)."""
+    """Decode the positions that :func:`encode_positions` wrote. Raises PacketError (without offset)."""
     number = len(scale_codes)
     if number == 0:
         if data:

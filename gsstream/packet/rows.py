@@ -22,7 +22,7 @@ def row_codes(gaussians: Gaussians[FloatArray]) -> dict[str, IntArray]:
 
 
 def decoded_rows(gaussians: Gaussians[FloatArray], codes: Mapping[str, IntArray]) -> Gaussians[FloatArray]:
-    """Return what a decoder makes of :func:`encode_rows`, float32."""
+    """Return the values that a decoder reads from :func:`encode_rows`, float32."""
     out = {name: _shaped(name, from_codes(name, table, KEY_BITS[name])) for name, table in codes.items()}
     out["means"] = quantise_positions(gaussians.means, codes["scales"], KEY_BITS["scales"])
     return Gaussians(**out)

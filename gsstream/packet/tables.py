@@ -1,4 +1,4 @@
-"""The entropy-coded tables of a packet and what they could cost at best: for measuring the coder, not for decoding."""
+"""The entropy-coded tables of a packet and their least possible size: for measuring the coder, not for decoding."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _KEY_HEAD, _DELTA_HEAD, _MEANS_HEAD, _LAYOUT_HEAD = 2, 6, 3, 9
 
 
 class Table(NamedTuple):
-    """A coded section or part: its bytes, and the empirical entropy of what they say."""
+    """A coded section or part: its bytes, and the empirical entropy of its symbols."""
 
     name: str
     size: int

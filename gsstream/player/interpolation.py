@@ -1,4 +1,4 @@
-"""Between two frames: what moved is on its way, by the displacement that packets carry; all else waits its frame."""
+"""Scenes between two frames: moved Gaussians are on their way, by the displacement in packets; others wait."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ _COUNTS = struct.Struct("<II")
 
 @dataclass(frozen=True, slots=True)
 class MemoryLimit:
-    """A limit, bytes, on what playing a stream takes, beside the program itself (about 80 MB)."""
+    """A limit in bytes on the memory for a stream, beside the program itself (about 80 MB)."""
 
     most: int
 
@@ -34,7 +34,7 @@ class MemoryLimit:
         self._check(2 * size, f"the packet of frame {frame}")
 
     def check_decoding(self, data: bytes, state: PlayerState | None, offset: int) -> None:
-        """Refuse a packet by what it announces, before it is decoded.
+        """Refuse a packet by the sizes that it announces, before it is decoded.
 
         Raises InputError beyond the limit, PacketError for a damaged packet.
         """
@@ -65,7 +65,7 @@ def _mb(size: int) -> str:
 
 
 def _key(sections: dict[str, Section]) -> int:
-    """Bytes for the sections of a key packet; what is missing or cut short is left to the decoder to refuse."""
+    """Bytes for the sections of a key packet; the decoder refuses sections that are missing or cut short."""
     layout, rest, meta = (sections[name].data if name in sections else b"" for name in ("layout", "shN", "meta"))
     gaussians, nodes = _COUNTS.unpack_from(layout) if len(layout) >= _COUNTS.size else (0, 0)
     channels = rest[1] if len(rest) > 1 else 0

@@ -1,4 +1,4 @@
-"""Camera paths computed from a calibrated rig: around what it looks at, a spiral around its middle; other sizes."""
+"""Camera paths from a calibrated rig: around the point it looks at, a spiral around its middle; other sizes."""
 
 from __future__ import annotations
 

@@ -144,7 +144,7 @@ class Playback:
             raise self.reader.damage
 
     def refresh(self) -> None:
-        """See what a writer has added since."""
+        """Read the packets that a writer has added since."""
         self.reader.refresh()
         self._entries = self.reader.frames
 

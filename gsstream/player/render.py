@@ -31,7 +31,7 @@ ENTRY_POINT_GROUP = "gsstream.player"
 
 
 class PlayerRenderer(NamedTuple):
-    """A renderer and who ships it."""
+    """A renderer and the distribution that ships it."""
 
     name: str
     render_numpy: Callable[..., FloatArray]

@@ -25,7 +25,7 @@ MOST_BITS = 30
 LARGEST, SMALLEST = 255 / 16 - 10, -10.0
 #: From the axes of a PLY to those of the format.
 TURN = np.diag([1.0, -1.0, -1.0])
-#: What the library of the format keeps of coefficients of degree 1, and of higher ones: 5 and 4 bits of 8.
+#: Steps, of 256, to which the library of the format rounds coefficients of degree 1, and of higher degrees.
 STEPS = (8, 16)
 
 

@@ -1,4 +1,4 @@
-"""Holding written keys and values against pydantic models, with messages that say where and what instead."""
+"""Checks of written keys and values by pydantic models; messages name the place and the nearest valid key."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ class Layer:
 
 
 def read_file(path: Path, label: str | None = None) -> Layer:
-    """Read a YAML file as a layer. Raises RecipeError for what is no YAML, a key given twice, an anchor."""
+    """Read a YAML file as a layer. Raises RecipeError for invalid YAML, a key given twice, an anchor."""
     return _layer(_text_of(path), str(path), label)
 
 
@@ -156,7 +156,7 @@ def _where(node: Node, name: str) -> str:
 
 
 def _walk(mapping: MappingNode, path: KeyPath, name: str) -> Iterator[tuple[KeyPath, Node, Any]]:
-    """(path, key node, value) of every key below a mapping, a section before what it holds."""
+    """(path, key node, value) of every key below a mapping, a section before its keys."""
     seen: dict[str, Node] = {}
     _refuse_anchor(mapping, _where(mapping, name))
     for key_node, node in mapping.value:
@@ -198,7 +198,7 @@ def _plain(node: Node, name: str, *, located: bool = True) -> Any:
     try:
         value = YAML(typ="safe", pure=True).constructor.construct_object(node)
     except (YAMLError, ValueError, ArithmeticError, LookupError, TypeError) as error:
-        # What a tag promises and the text does not hold: !!int abc, !foo, an integer of five thousand digits.
+        # The text does not hold a value of the type in its tag: !!int abc, !foo, an integer of five thousand digits.
         reason = getattr(error, "problem", None) or str(error)
         raise RecipeError(f"{where}: {textwrap.shorten(str(node.value), 60)!r} has no plain value: {reason}") from error
     if value is not None and not isinstance(value, str | bool | int | float):

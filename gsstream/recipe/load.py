@@ -49,7 +49,7 @@ class ResolvedRecipe:
         return DEFAULT
 
     def near(self, path: KeyPath) -> Origin:
-        """Return where to look for a problem at ``path``: what was written there, below it, or closest around it."""
+        """Return the place of a problem at ``path``: of the value written there, below it, or closest around it."""
         for end in range(len(path), 0, -1):
             for written, origin in self.origins.items():
                 if written[:end] == path[:end]:
@@ -108,7 +108,7 @@ def resolve_recipe(
 
 
 def _later_file(path: Path, find_method: FindMethod) -> list[Layer]:
-    """The layers of a file laid over another: it must not bring a method, which would undo what lies below."""
+    """The layers of a file laid over another: it must not name a method, which would undo the layers below."""
     layers = _file_chain(path, find_method, ())
     for leaf in (layer.leaves[("method",)] for layer in layers if ("method",) in layer.leaves):
         raise RecipeError(
@@ -119,7 +119,7 @@ def _later_file(path: Path, find_method: FindMethod) -> list[Layer]:
 
 
 def load_recipe(path: Path) -> ResolvedRecipe:
-    """Read a complete recipe, such as the one saved beside a result; what it leaves out takes the model's default."""
+    """Read a complete recipe, such as the one saved beside a result; missing keys take the model's defaults."""
     layer = read_file(path)
     if ("base",) in layer.leaves:
         raise RecipeError(f"{layer.leaves[('base',)].origin.where}: a complete recipe has no 'base'")
@@ -188,7 +188,7 @@ def _file_chain(path: Path, find_method: FindMethod, within: tuple[str, ...], la
 
 
 def _put(leaves: dict[KeyPath, Leaf], path: KeyPath, leaf: Leaf) -> None:
-    """Set a leaf; whatever stood above or below that path gives way."""
+    """Set a leaf; values above or below that path are removed."""
     for other in [p for p in leaves if p[: len(path)] == path or path[: len(p)] == p]:
         del leaves[other]
     leaves[path] = leaf

@@ -20,7 +20,7 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 @dataclass(frozen=True, slots=True)
 class PartSchema:
-    """A part as a schema sees it: what it is, and its settings; None where the plugin could not be imported."""
+    """A part in a schema: its summary and its settings; None where the plugin could not be imported."""
 
     summary: str
     config: type[PartConfig] | None

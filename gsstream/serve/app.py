@@ -112,7 +112,7 @@ def make_app(stream: Path, *, live: bool, rules: Rules, max_viewers: int, hub_of
 
 
 class _Guard:
-    """Refuses what the rules do not allow, before anything else sees the request; says how answers may be used."""
+    """Refuses requests that the rules do not allow, before any other handler; adds headers on the use of answers."""
 
     HEADERS = (
         (b"cache-control", b"no-cache"),
@@ -163,7 +163,7 @@ def _after(websocket: WebSocket) -> tuple[int, bytes] | None:
 
 
 def _manifest(follower: Follower, *, live: bool) -> Response:
-    """Tell the player what there is: the socket of a live stream, or the segments of a recording."""
+    """Return the player's configuration: the socket of a live stream, or the segments of a recording."""
     from starlette.responses import JSONResponse, PlainTextResponse
 
     if live:

@@ -63,7 +63,7 @@ class Follower:
             self._reader = None
 
     def look(self) -> bool:
-        """See what was written since the last look. Returns whether anything changed."""
+        """Read the packets that were written since the last call. Returns whether anything changed."""
         try:
             seen = self.path.stat()
         except OSError:
@@ -91,7 +91,7 @@ class Follower:
             return file.read(FILE_HEADER.size)
 
     def state(self) -> State:
-        """Say what the stream is doing."""
+        """Return the state of the stream."""
         if self._seen is None:
             return State("waiting", "The stream is not there yet.")
         if self._reader is None:
@@ -105,7 +105,7 @@ class Follower:
         return State("live") if self.count else State("waiting", "No frame is encoded yet.")
 
     def _goes_on(self, size: int) -> bool:
-        """Whether the file still holds what was read from it."""
+        """Return whether the file still begins with the bytes that were read from it."""
         if not self.count:
             return True
         last = self.entries[self.count - 1]

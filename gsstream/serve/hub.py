@@ -1,4 +1,4 @@
-"""One stream and those who watch it live: look at the file, and send each viewer one packet after the other."""
+"""One stream and its live viewers: the file is read as it grows, and each viewer is sent one packet after the other."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ async def _tell(socket: WebSocket, **facts: Any) -> None:
 
 
 def _raise_unless_gone(task: asyncio.Task[None]) -> None:
-    """Raise what ended a task, unless that is a viewer who left."""
+    """Raise the error that ended a task, unless its viewer left."""
     from starlette.websockets import WebSocketDisconnect
 
     error = task.exception()

@@ -28,7 +28,7 @@ from gsstream.serve.joins import encode_join, track_rows
 
 MANIFEST, POSTER = "stream.json", "poster.jpg"
 SEGMENTS = "segments"
-#: Whole lines of a module: a fifth of what a visitor would load.
+#: Comments that fill whole lines of a module: a fifth of the bytes that a visitor would load.
 _COMMENTS = re.compile(rb"^[ \t]*(?://[^\n]*|/\*\*.*?\*/)\n", re.MULTILINE | re.DOTALL)
 
 
@@ -116,7 +116,7 @@ def _old_files(folder: Path) -> set[str]:
 
 
 def _remove_partial(folder: Path, old: set[str]) -> None:
-    """Remove what a package that failed had written beside the files of the one before."""
+    """Remove the files of a package that failed from the folder of the package before it."""
     for path in (folder / SEGMENTS).glob("*"):
         if f"{SEGMENTS}/{path.name}" not in old:
             path.unlink(missing_ok=True)
@@ -150,7 +150,7 @@ def _write_stream(path: Path, folder: Path, join_every: float) -> dict[str, Any]
 
 
 def _write_segment(reader: StreamReader, entries: Sequence[Entry], folder: Path, every: int) -> dict[str, Any]:
-    """Write a key packet with what follows, and a join after every so many frames; returns the segment's entry."""
+    """Write a key packet with the packets after it, and a join after every so many frames; return its entry."""
     with reader.path.open("rb") as file:  # its own header: a stream may be of an older minor version
         header = file.read(len(file_header()))
     data = header + b"".join(reader.read(entry) for entry in entries)
@@ -212,7 +212,7 @@ def _poster(stream: Path) -> bytes:
 
 
 def _titled(page: str, name: str) -> str:
-    """The page with a name, and what other pages show of a link to it."""
+    """Return the page with a title, and the preview that other pages show of a link to it."""
     title = html.escape(name)
     tags = f'<meta property="og:title" content="{title}">\n<meta property="og:image" content="{POSTER}">'
     return page.replace("<title>gsstream</title>", f"<title>{title}</title>\n{tags}").replace(

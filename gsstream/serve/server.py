@@ -87,7 +87,7 @@ class Server:
         asyncio.run(self._serve())
 
     def close(self, drain: float = 0.0) -> None:
-        """Stop serving. ``drain``: seconds in which viewers may still take what they have not got."""
+        """Stop serving. ``drain``: seconds in which viewers may still receive their remaining packets."""
         if self._thread is not None:
             hub = self._hubs[-1] if self._hubs else None
             if drain and hub is not None and self._loop is not None:

@@ -1,4 +1,4 @@
-"""Tiny seeded worlds, made on the CPU: what the checks are made on."""
+"""Tiny seeded worlds, made on the CPU, on which parts are checked."""
 
 from __future__ import annotations
 
@@ -199,7 +199,7 @@ def make_case(name: str, before: Scene, cameras: Cameras, *, shift: float = 0.0)
 
 
 def images(gaussians: Scene, cameras: Cameras) -> tuple[torch.Tensor, ...]:
-    """Return what the cameras see, without noise: one [H, W, 3] per camera, by the reference renderer."""
+    """Return the images of the cameras, without noise: one [H, W, 3] each, by the reference renderer."""
     with torch.no_grad():
         return tuple(RENDERER.render(gaussians, cameras, view, BLACK).image for view in range(len(cameras)))
 

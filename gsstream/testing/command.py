@@ -22,7 +22,7 @@ class CommandUnderTest:
         return f"command {self.spec.name}"
 
     def made(self) -> Any:
-        """Return what typer makes of it. Raises PluginUnavailable."""
+        """Return the command that typer makes of the declaration. Raises PluginUnavailable."""
         entry = Entry(self.spec, self._origin, self._origin, "")
         return command_of(self.spec, Catalog({("command", self.spec.name): entry}, ()))
 

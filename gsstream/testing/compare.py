@@ -8,8 +8,8 @@ import torch
 
 EXACT = "bitwise: the same operations on the same numbers"
 ROUNDING = "float32 rounding over a few hundred terms"
-#: Of the largest gradient of a scene. A gradient that is smaller than this all over, such as that of the rotation of
-#: round Gaussians, is what is left of large terms that cancel, and its digits are rounding.
+#: Share of the largest gradient of a scene. A gradient that is smaller than this share all over, such as
+#: the gradient of the rotation of round Gaussians, is the rest of large terms that cancel: its digits are rounding.
 FLOOR = 0.01
 
 

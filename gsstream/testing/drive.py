@@ -1,4 +1,4 @@
-"""What the common checks have to know of a kind: how the engine calls such a part, and what its outputs mean."""
+"""Knowledge of the common checks about a kind: how the engine calls such a part, and how its outputs are compared."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def behaviour_of(part: Part) -> Behaviour:
 
 
 def outputs(part: Part, world: World) -> Outputs:
-    """Return what ``part`` makes of a world, tensor by tensor."""
+    """Return the outputs of ``part`` on a world, tensor by tensor."""
     return behaviour_of(part).outputs(part, world)
 
 

@@ -1,4 +1,4 @@
-"""The contract kit: what every part promises, checked. By pytest, by code, or by ``gsstream check NAME``."""
+"""The contract kit: checks of the promises of every part, by pytest, by code, or by ``gsstream check NAME``."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def run_checks(part: Part | SourceUnderTest, expected_failures: Mapping[str, str
 
 
 def skip_checks(kind: str, name: str, reason: str) -> list[CheckResult]:
-    """Return what :func:`run_checks` says of a part that cannot be made here: every check of its kind is skipped."""
+    """Return the results for a part that cannot be made here: every check of its kind is skipped."""
     return [CheckResult(entry.name, name, "skipped", reason) for entry in checks_for(kind)]
 
 

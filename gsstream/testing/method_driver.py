@@ -95,7 +95,7 @@ class MethodUnderTest:
         return encoder.state
 
     def play(self, state: PlayerState | None, data: bytes) -> PlayerState:
-        """Do what a player does with a packet."""
+        """Return the player's state after a packet."""
         return decode_packet(state, data)
 
     def chain(self, uri: str = SOURCE, choose: Callable[[Frame], Frame] | None = None) -> list[EncodedFrame]:

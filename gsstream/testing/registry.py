@@ -31,10 +31,8 @@ class Check:
     name: str  # name of the function; stable, because expected failures are given by it
     kind: str  # "common", a kind of part, "source", "method", "packet" or "command"
     kinds: tuple[str, ...]  # kinds of part that the check is made on
-    trait: (
-        str | None
-    )  # only parts that claim this field of their ``Traits`` are checked; None: every part
-    function: Callable[..., None]  # raises AssertionError with numbers
+    trait: str | None  # only parts that claim this field of their ``Traits`` are checked; None: every part
+    function: Callable[..., None]  # raises an AssertionError that states numbers
 
     @property
     def meaning(self) -> str:
@@ -76,7 +74,7 @@ def checks_for(kind: str) -> list[Check]:
 
 
 def expected_failure_of(subject: object) -> dict[str, str]:
-    """Check -> why it fails, of all that a part denies; nothing for what is no part, or a part that cannot say it."""
+    """Return check -> reason of all checks that a part denies; empty for other subjects, and when the part raises."""
     if not isinstance(subject, Part):
         return {}
     try:

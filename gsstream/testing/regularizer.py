@@ -15,7 +15,7 @@ from gsstream.testing.compare import ROUNDING, at_most, equal, finite
 from gsstream.testing.drive import Behaviour, Outputs, poisons_of
 from gsstream.testing.registry import check
 
-#: Of a scene, so that a sum that is added up one by one in float32 would lose digits: a million rows.
+#: Number of rows of a large scene: a sum of so many values in float32, one after another, loses digits.
 COPIES = 5000
 
 

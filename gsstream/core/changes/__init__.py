@@ -1,4 +1,4 @@
-"""What a frame may say: an ordered list of changes, each a frozen record and one numpy function that applies it.
+"""The changes of a frame: an ordered list, each a frozen record and one numpy function that applies it.
 
 The list of kinds is short and closed, so that every player can play every stream: encoder and player call the same
 functions, and a stream never needs a plugin. The arithmetic is +, -, x, / and square root in a stated order and

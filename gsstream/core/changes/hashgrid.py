@@ -19,7 +19,7 @@ from gsstream.core.shapes import FloatArray, IntArray
 ENTRY_BITS, ENTRY_RANGE = 20, 26
 WEIGHT_BITS, WEIGHT_RANGE = 14, 18
 MAX_LEVELS, MAX_FEATURES, MAX_LAYERS, MAX_BASE, MAX_CELLS = 16, 8, 4, 1024, 1 << 20
-#: Of a layer: no more than all levels together have features.
+#: Largest width of a layer: the number of features of all levels together.
 MAX_INPUTS = MAX_LEVELS * MAX_FEATURES
 #: Entries of all levels together, at most.
 MAX_ENTRIES = 1 << 20
@@ -153,7 +153,7 @@ class FieldShape:
         return out
 
     def start_entries(self, level: int, entries: IntArray) -> IntArray:
-        """Return what learning starts from at some entries [E] of a level: [E, F] whole numbers of 2^-20."""
+        """Return the first values of some entries [E] of a level: [E, F] whole numbers of 2^-20."""
         first = ((level << self.entries) + entries) * self.features
         return _drawn(self.seed, first[:, None] + np.arange(self.features), START)
 
@@ -215,7 +215,7 @@ def _interpolated(column: FloatArray, of: IntArray, near: FloatArray) -> FloatAr
 
 
 def _rounded(values: FloatArray) -> FloatArray:
-    """The nearest whole numbers, halves upwards: what every language can do in two exact steps."""
+    """Round to the nearest whole numbers, halves upwards, in two steps that are exact in every language."""
     return np.asarray(np.floor(values + 0.5))
 
 

@@ -220,7 +220,7 @@ def _optimiser(catalog: Catalog, compiled: bool) -> Part:
             cls = catalog.resolve("optimiser", COMPILED)
             return construct("optimiser", COMPILED, cls, config=cls.Config(), catalog=catalog)
         except (UnknownName, PluginUnavailable):
-            pass  # what keeps a plugin from working is shown where its renderer is chosen
+            pass  # the reason why a plugin does not work is printed where its renderer is chosen
     cls = catalog.resolve("optimiser", REFERENCE)
     return construct("optimiser", REFERENCE, cls, config=cls.Config(), catalog=catalog)
 

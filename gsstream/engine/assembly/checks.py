@@ -1,4 +1,4 @@
-"""How closely a run looks at what parts return: off, frame or step (``GSSTREAM_CHECKS``).
+"""How strictly a run checks the values that parts return: off, frame or step (``GSSTREAM_CHECKS``).
 
 Nothing that is sent depends on the level: it decides when a wrong number is noticed, and how precisely it is named.
 """
@@ -48,7 +48,7 @@ def requested_checks(given: str | None = None) -> Checks:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Looks at what one part returned."""
+    """Checks the values that one part returned."""
 
     level: Checks  # how closely
     #: slot, part: whose it is.

@@ -19,7 +19,7 @@ from gsstream.core.part import Part
 from gsstream.discovery.catalog import Catalog
 
 VARIABLE = "GSSTREAM_DEVICE"
-#: What is tried, in this order, before the reference is taken.
+#: Renderers that are tried, in this order, before the reference is taken.
 ON_GPU, COMPILED = "gsplat", "cpu"
 
 
@@ -36,7 +36,7 @@ class Chosen(NamedTuple):
 
 
 def requested_device(environment: Mapping[str, str] = os.environ) -> str:
-    """Return what the environment asks for: auto, cpu, cuda or cuda:N. Raises InputError for anything else."""
+    """Return the device named in the environment: auto, cpu, cuda or cuda:N. Raises InputError for any other value."""
     text = environment.get(VARIABLE, "") or "auto"
     if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", text):
         raise InputError(f"{VARIABLE}: expected auto, cpu, cuda or cuda:N, got {text!r}")

@@ -17,7 +17,7 @@ class Where:
     iteration: int | None = None
 
     def enter(self, frame: int | None) -> None:
-        """Begin a frame; no iteration of it has begun."""
+        """Note that a frame begins; its first iteration has not begun."""
         self.frame, self.iteration = frame, None
 
     def iterate(self, first: int, place: int) -> None:
@@ -29,12 +29,12 @@ class Where:
         self.iteration = 1 if self.iteration is None else self.iteration + 1
 
     def pause(self) -> None:
-        """Note that no iteration goes on: a part has ended its own."""
+        """Note that the iterations of a part have ended."""
         self.iteration = None
 
 
 def fault(message: str, slot: str, part: object, where: Where | None = None) -> ComponentError:
-    """Return the error about a part that failed, or did not do what it must."""
+    """Return the error about a part that raised an error or broke its contract."""
     owner = _distribution(type(part).__module__.partition(".")[0])
     place = where or Where()
     return ComponentError(
@@ -43,7 +43,7 @@ def fault(message: str, slot: str, part: object, where: Where | None = None) -> 
 
 
 def _distribution(package: str) -> str:
-    """Who ships a top-level package. Entry points first: of an editable install the list of files says nothing."""
+    """Return the distribution of a top-level package. Entry points are asked first: editable installs list no files."""
     for point in entry_points(group=ENTRY_POINT_GROUP):
         if point.dist is not None and point.module.partition(".")[0] == package:
             return point.dist.name

@@ -36,7 +36,7 @@ BODIES: Mapping[tuple[str, str], Callable[..., Any]] = {
 
 @contextmanager
 def error_context(slot: str, part: object, where: Where) -> Iterator[None]:
-    """Turn what a part raises into a ComponentError with slot, part, distribution, frame and iteration.
+    """Turn an error of a part into a ComponentError with slot, part, distribution, frame and iteration.
 
     A ShapeError is turned, too: it says that this part refuses what another part gave it. Of a renderer so is every
     InputError, because a renderer is given nothing but arrays. Other errors of gsstream pass unchanged.
@@ -67,7 +67,7 @@ def _line_of(error: Exception, part: object) -> str:
 
 
 class Guarded:
-    """Calls a part and stands in its place; what it raises names the part, what it returns is checked."""
+    """Stands in the place of a part: errors of the part name the part, and values that it returns are checked."""
 
     def __init__(self, slot: str, part: object, where: Where, level: Checks, kind: str = "") -> None:
         self._slot, self._part, self._where, self._level = slot, part, where, level
@@ -75,7 +75,7 @@ class Guarded:
 
     @classmethod
     def opened(cls, result: object, slot: str, part: object, where: Where, level: Checks) -> object:
-        """Return what a part has opened behind a guard that names the part; any other result as it is."""
+        """Return a session that a part opened behind a guard that names the part; return any other result as it is."""
         if not isinstance(result, (RenderSession, ResidualOptimiser)):
             return result
         made = cls(slot, part, where, level, SESSION if isinstance(result, RenderSession) else RESIDUAL)
@@ -105,7 +105,7 @@ class Guarded:
         return Guarded.opened(body(self, *args, **kwargs), self._slot, self._part, self._where, self._level)
 
     def _value(self, name: str) -> Any:
-        """An attribute of the part; what a property of it raises is the part's failure like any other."""
+        """Return an attribute of the part; an error in a property is a failure of the part like any other."""
         try:
             return getattr(self._subject, name)
         except Exception as error:

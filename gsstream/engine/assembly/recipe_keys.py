@@ -12,9 +12,9 @@ from gsstream.recipe.model import Recipe
 
 #: Sections that, beside the slots of parts, only a method made of parts reads.
 PART_SECTIONS = ("stream", "codec", "budget")
-#: Of those sections, what the engine itself reads for every method, also for frame 0, which it makes for them.
+#: Keys of those sections that the engine itself reads for every method, also to make frame 0.
 SESSION_KEYS = ("codec.key_rd_lambda", "codec.first_layer", "budget.memory", "stream.on_error")
-#: What only the optimisation of a residual reads: slots, and settings.
+#: Slots and settings that only the optimisation of a residual reads.
 RESIDUAL_KEYS = (
     "confidence", "propagation", "gate", "regularizer", "stream.epochs", "stream.lr_final_factor",
     "stream.active_threshold", "stream.rd_lambda", "stream.progressive",

@@ -1,4 +1,4 @@
-"""What a run is called where runs are compared: its method, and what was changed of that method's recipe."""
+"""Title of a run in comparisons: its method, and the settings in which the run differs from the method's recipe."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Constants of the optimisation that no recipe changes: rates of 3DGS, and what keeps a scene tidy.
+"""Constants of the optimisation that no recipe changes: rates of 3DGS, pruning and penalties.
 
 The rates and the rules of pruning are those of 3DGS (Kerbl et al. 2023); the penalties are gsstream's own, and held-out
 quality is why they are there.
@@ -24,10 +24,10 @@ DENSIFY_FROM, DENSIFY_EVERY = 300, 100
 DENSIFY_GRADIENT = 3e-4
 #: Share of the iterations after which nothing is densified or pruned any more.
 DENSIFY_UNTIL = 0.6
-#: Shares of the iterations after which what the images would not miss goes: when growth has ended, and once more while
-#: there is time to close the gaps. Earlier, what is pruned grows again.
+#: Shares of the iterations after which Gaussians that the images would not miss are removed: when growth has ended,
+#: and once more while there is time to close the gaps. Gaussians that are removed earlier grow again.
 PRUNE_AT = (0.6, 0.8)
-#: The same where pictures of several sizes follow each other: detail is added until well into the largest ones.
+#: The same number where pictures of several sizes follow each other: detail is added until well into the largest size.
 PYRAMID_DENSIFY_UNTIL, PYRAMID_PRUNE_AT = 0.8, (0.85,)
 #: Gaussians below this opacity are removed, and those wider than this fraction of the rig's extent or, where that is
 #: larger, this multiple of a seed of the shell: a rig may be small beside what it looks at.

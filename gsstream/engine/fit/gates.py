@@ -47,7 +47,7 @@ class TrainedGates:
         return self.hierarchy.node_of
 
     def draw_ahead(self, iterations: int) -> None:
-        """Draw the noise of the next iterations, where the logits are on a GPU: what is drawn crosses in one copy."""
+        """Draw the noise of several iterations where the logits are on a GPU, so that all of it is copied at once."""
         if self.logits.device.type == "cpu":
             return
         drawn = [self._noise() for _ in range(iterations)]

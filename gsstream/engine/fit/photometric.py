@@ -24,7 +24,7 @@ class PhotometricLoss:
         self._prepared: dict[int, Any] = {}
 
     def view_target(self, view: int, tile_weights: torch.Tensor | None = None) -> ViewTarget:
-        """Return what renders of a view are compared with."""
+        """Return the target that renders of a view are compared with."""
         image = self.images.stored(view)
         if view not in self._prepared:
             self._prepared[view] = self._loss.prepare(image if self._takes_bytes else self.images[view])

@@ -85,7 +85,7 @@ def check_cameras(cameras: Cameras, least: int, who: str) -> None:
 
 
 def decoded_anchors(player: PlayerState) -> Anchors:
-    """Return what a structure needs to group a decoded scene again."""
+    """Return the anchors that a structure needs to group a decoded scene again."""
     gaussians, origin = player.gaussians.map(torch.from_numpy), player.meta.extra.get("origin")
     if origin is None:
         raise InputError(
@@ -114,7 +114,7 @@ def sort_into_nodes(
 
 
 def make_layout(hierarchy: Hierarchy, levels: torch.Tensor, anchors: Anchors) -> Layout:
-    """Return what both ends know until the next key packet."""
+    """Return the layout that encoder and player have until the next key packet."""
     counts = torch.bincount(hierarchy.node_of, minlength=hierarchy.num_nodes)
     return Layout(
         node_counts=counts.numpy().astype(np.int32),
@@ -133,7 +133,7 @@ def key_state(
     rng: Rng,
     first: BoolArray | None = None,
 ) -> tuple[StreamState, EncodedPacket]:
-    """Encode a key packet and continue from its decoded bytes; ``meta`` is that of :func:`key_meta`."""
+    """Encode a key packet and continue from its decoded bytes; ``meta``: result of :func:`key_meta`."""
     arrays: Gaussians[FloatArray] = gaussians.map(lambda t: np.ascontiguousarray(t.numpy()))
     packet = encode_key(KeyState(arrays, layout, meta), frame=frame.index, first=first)
     player = decode_packet(None, packet.data)
@@ -150,7 +150,7 @@ def key_state(
 
 
 def key_meta(meta: StreamMeta, exposure: Exposure | None, origin: torch.Tensor) -> StreamMeta:
-    """Return what a key packet says about the run, with the colour maps and the origin [3] of the structure's grid."""
+    """Return the description of the run in a key packet, with colour maps and the origin [3] of the grid."""
     own = {**exposure_to_meta(exposure), "origin": origin.tolist()}
     others = {name: value for name, value in meta.extra.items() if name not in own}
     return replace(meta, extra={**others, **own})

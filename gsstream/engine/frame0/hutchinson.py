@@ -37,7 +37,7 @@ class TrainingViews:
     background: tuple[float, float, float]
 
     def error(self, view: int, image: torch.Tensor) -> float:
-        """Return the mean squared error of what a camera would record [H, W, 3]."""
+        """Return the mean squared error of a camera's exposed render [H, W, 3]."""
         return float((image - torch.from_numpy(self.frame.image(view)).to(image.device)).square().mean())
 
 
@@ -58,7 +58,7 @@ def random_signs(like: torch.Tensor, generator: torch.Generator) -> torch.Tensor
     Eight are drawn at a time: one by one they take as long as a render of a large picture.
     """
     drawn = torch.randint(0, 256, (-(-like.numel() // 8),), generator=generator, dtype=torch.uint8)
-    # As bytes, a quarter of what they become, for they may have to cross to a GPU.
+    # As bytes, a quarter of the size of the floats that they become: the signs may have to cross to a GPU.
     bits = torch.from_numpy(np.unpackbits(drawn.numpy(), count=like.numel())).to(like.device)
     return bits.to(like.dtype).mul_(2).sub_(1).reshape(like.shape)
 

@@ -182,7 +182,7 @@ class FirstFrameRun:
         return Gaussians(**{name: self.table[name] for name in ATTRIBUTES})
 
     def enter(self, level: PyramidLevel) -> None:
-        """Go on with pictures of another size; what is drawn keeps its width, and statistics of growth begin anew."""
+        """Go on with pictures of another size: Gaussians keep their drawn width, statistics of growth begin anew."""
         if level == self.level:
             return
         scene = self.gaussians().map(torch.Tensor.detach)
@@ -261,7 +261,7 @@ class FirstFrameRun:
         return found
 
     def _area_price(self, iteration: int) -> float:
-        """Price of what is covered: none after the pruning, so that what remains fits the pictures alone."""
+        """Return the price of covered pixels: 0 after the pruning, so that the others fit the pictures alone."""
         wanted = iteration < self.pyramid.prune_at[0] * self.iterations
         return area_price(self.whole.cameras.width) if wanted else 0.0
 
@@ -275,7 +275,7 @@ class FirstFrameRun:
         self.statistics = DensifyStatistics.zeros(len(self.levels), self.device)
 
     def _prune(self) -> None:
-        """Drop what the images would not miss; what remains has time to close the gaps."""
+        """Remove Gaussians that the images would not miss; the others have time to close the gaps."""
         gaussians = self.gaussians().map(torch.Tensor.detach)
         exposure = self.exposure.exposure if self.exposure else self.photometric.exposure
         views = TrainingViews(self.renderer, self.frame, exposure, self.assembly.background)

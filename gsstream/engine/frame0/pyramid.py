@@ -54,7 +54,7 @@ class PyramidLevel:
 
 @dataclass(frozen=True, slots=True)
 class Pyramid:
-    """Levels of picture size, the coarsest first, and when growth ends and what is not missed goes: shares of all."""
+    """Levels of picture size, the coarsest first; shares of the iterations at which growth ends and pruning happens."""
 
     levels: tuple[PyramidLevel, ...]
     densify_until: float

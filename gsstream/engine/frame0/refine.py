@@ -52,7 +52,7 @@ def refine_first_frame(assembly: Assembly, state: StreamState, step: Step, frame
 
 
 def runs_after_packet(stream: Stream, state: StreamState, frame: Frame) -> bool:
-    """Say whether what a frame gives to the refinement can be made after its packet: its last iterations cannot."""
+    """Return whether a frame's iterations of the refinement may follow its packet: the last ones of all may not."""
     if not is_refining(stream, state):
         return False
     made = 0 if state.refinement is None else state.refinement.iterations

@@ -43,7 +43,7 @@ class Regularisers:
 
 
 def choose_regularisers(settings: FirstFrame, cameras: Cameras) -> Regularisers:
-    """Return what suits so many training cameras; nothing where the recipe does not want it."""
+    """Return the regularisers for so many training cameras; none where the recipe switches them off."""
     if not settings.few_cameras or len(cameras) > FEW:
         return Regularisers(0.0, 0.0)
     pays = (len(cameras) >= SMOOTHNESS_CAMERAS) == stands_around(cameras)

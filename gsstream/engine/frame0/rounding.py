@@ -1,4 +1,4 @@
-"""Rounding by what a bit buys: each value takes the code with the least squared error plus weight times bits.
+"""Rounding by the price of a bit: each value takes the code with the least squared error plus weight times bits.
 
 Video encoders call it rate-distortion optimised quantisation. Among the codes near a value some occur more often than
 others, and cost fewer bits; where the images are hardly sensitive to the value, one of those does as well. A player
@@ -38,7 +38,7 @@ def rd_codes_to_zero(exact: FloatArray, sensitivity: FloatArray, weight: float) 
 
 
 def rd_codes_nearby(exact: FloatArray, sensitivity: FloatArray, weight: float, reach: int) -> IntArray:
-    """Return the same among all codes within ``reach`` of the nearest one, for what must stay about what it is."""
+    """Return the best code within ``reach`` of the nearest code, for values that may change only a little."""
     # The nearest one first, then by distance: of equally good ones the nearer is taken.
     offsets = sorted(range(-reach, reach + 1), key=lambda offset: (abs(offset), offset))
 

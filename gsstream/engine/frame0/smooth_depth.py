@@ -1,4 +1,4 @@
-"""Depth that changes only where the picture does: what keeps shards from standing across a wall."""
+"""A penalty on depth that changes where the picture does not; it prevents shards that stand across a wall."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gsstream.parts.render.base import Renderer
 
 #: Difference of two pixels, in [0, 1], over which a change of depth becomes e times cheaper.
 EDGE = 0.1
-#: What is differentiated; colours have no part in depth.
+#: Attributes that depth is differentiated by; it does not depend on colours.
 PLACED = ("means", "quats", "scales", "opacities")
 #: Extents of the rig at which inverse depth is 1, at which it ends, and the least depth that is told apart.
 UNIT, MOST, NEAREST = 0.3, 3.0, 0.02

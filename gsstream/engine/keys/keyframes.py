@@ -1,4 +1,4 @@
-"""Later key packets: when a frame becomes one, and what it holds.
+"""Later key packets: the frames that become key packets, and the contents of these packets.
 
 A key packet takes the place of the frame's delta packet: it holds the scene after the frame's optimisation, put on the
 grids of a key packet and grouped anew, and the encoder goes on from it as any player does.

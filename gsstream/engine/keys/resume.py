@@ -26,7 +26,7 @@ ENDING = {"data": ("bad_image",), "stream": ("on_error",)}
 
 
 class Ended(NamedTuple):
-    """Where a stream ends: what players have, the frame whose picture this scene shows, the last key frame."""
+    """End of a stream: the players' state, the frame whose pictures this scene shows, the last key frame."""
 
     player: PlayerState
     shown: int
@@ -50,7 +50,7 @@ def read_end(path: Path, last: int | None = None) -> Ended:
 
 
 def states_since_key(path: Path, end: Ended) -> Iterator[PlayerState]:
-    """Yield what players have after every packet from the last key packet to the end."""
+    """Yield the players' state after every packet from the last key packet to the end."""
     for player, _ in _decoded_states(path, end.player.frame):
         if player.frame >= end.key_frame:
             yield player
@@ -146,7 +146,7 @@ def _check_recipe(assembly: Assembly, meta: StreamMeta) -> None:
 
 
 def _deciding_keys(section: str, values: Any) -> Any:
-    """A section of a recipe without what only decides where a run ends, and not what the packets before hold.
+    """Return a section of a recipe without the keys that only decide where a run ends: they change no packet.
 
     So may the number of frames, which grows, and what is done about pictures that cannot be read and parts that fail.
     """

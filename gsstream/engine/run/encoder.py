@@ -239,7 +239,7 @@ class Encoder:
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Run what is inside with one thread of torch, and restore the number afterwards.
+    """Run the body with one thread of torch, and restore the number afterwards.
 
     Torch's share of a frame is elementwise work on few rows: more threads cost more than they give, and spin against
     the native kernels' own pool. One thread also keeps its sums, and so the bytes, independent of the machine's cores.

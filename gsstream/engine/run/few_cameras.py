@@ -1,4 +1,4 @@
-"""What a run says about its cameras: before it what to expect of few of them, after frame 0 what was done about it."""
+"""Advice about few cameras: the quality to expect, before a run, and the measures taken in frame 0, after it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ONE_SIDE = "4 cameras along an arc of 68 degrees 28 dB, 6 cameras 31, 11 cameras
 
 
 def widest_gap(cameras: Cameras) -> float:
-    """Return the largest angle from a camera to its nearest neighbour, degrees, seen from what all look at."""
+    """Return the largest angle between a camera and its nearest neighbour, degrees, at the point that all look at."""
     outward = cameras.centers - focus_point(cameras)
     outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12)
     angles = np.degrees(np.arccos(np.clip(outward @ outward.T, -1, 1)))
@@ -28,7 +28,7 @@ def widest_gap(cameras: Cameras) -> float:
 
 
 def expectation(cameras: Cameras) -> str:
-    """Return one sentence on what few or distant cameras give, and what helps; empty where there are enough."""
+    """Return one sentence on the quality that few or distant cameras allow, and on a cure; empty for enough cameras."""
     gap = widest_gap(cameras)
     if len(cameras) >= ENOUGH_CAMERAS and gap <= CLOSE_DEGREES:
         return ""
@@ -42,7 +42,7 @@ def expectation(cameras: Cameras) -> str:
 
 
 def first_frame_summary(assembly: Assembly, cameras: Cameras, seeds: str) -> str:
-    """Return one line on what frame 0 was made with, and why: ``seeds`` names where its points came from."""
+    """Return one line on the measures taken in frame 0, and their reason; ``seeds``: source of the first points."""
     settings = assembly.recipe.first_frame
     chosen, number = choose_regularisers(settings, cameras), len(cameras)
     colour = ", ".join(f"{value:.2f}" for value in assembly.background)

@@ -8,7 +8,7 @@ from typing import Any
 
 from gsstream.core.frame import Frame
 
-#: What the summary, and what a frame's line, says of each policy.
+#: Policy -> its words in the summary and in the line of a frame.
 COUNTED: Mapping[str, str] = {
     "dropped": "{} dropped because the run was behind",
     "missing": "{} dropped because a camera's image did not come",
@@ -52,7 +52,7 @@ def _policy(frame: Frame) -> str | None:
 
 
 def latency_words(metrics: Mapping[str, Any]) -> list[str]:
-    """Return what a frame's line says of its latency; empty for a recording that is not live."""
+    """Return the latency of a frame for its line of metrics; empty for a recording that is not live."""
     live = metrics.get("live")
     if live is None:
         return []
@@ -62,7 +62,7 @@ def latency_words(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def latency_lines(lines: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return what the summary of a run says of its latency; empty for a recording that was not live.
+    """Return the lines on latency in the summary of a run; empty for a recording that was not live.
 
     A dropped frame has a latency in its metrics, but it shows nothing new: median and worst are of the others.
     """

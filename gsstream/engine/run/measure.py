@@ -22,7 +22,7 @@ MAX_TRAIN_VIEWS = 4
 
 
 class HeldOut:
-    """Renders the decoded scene for the test cameras and compares with what they saw.
+    """Renders the decoded scene for the test cameras and compares the renders with their images.
 
     Moving pixels are those that differ from frame 0 beyond the camera's noise; the noise is measured once, between the
     first two frames.
@@ -50,7 +50,7 @@ class HeldOut:
         return out
 
     def doubt(self, player: PlayerState, train: Frame, measured: Mapping[str, float | None]) -> str:
-        """Say in a line when frame 0 shows the training cameras what they saw and the held-out ones something else."""
+        """Return a warning when frame 0 fits the training cameras and not the held-out cameras."""
         held_out = [value for value in measured.values() if value is not None]
         if not held_out or float(np.mean(held_out)) >= LOW_PSNR_DB:
             return ""
@@ -65,7 +65,7 @@ class HeldOut:
         )
 
     def remember(self, first: Frame, second: Frame | None) -> None:
-        """Note what a resumed run must know of the frames it does not redo."""
+        """Keep frame 0, and the noise between the first two frames, from which frames of a resumed run are measured."""
         self._first = first
         if second is not None:
             self._sigma = _noise(first, second)

@@ -22,7 +22,7 @@ from gsstream.core.errors import OutputError
 LOCK = "run.lock"
 #: Files that say "a run lives here", and that a run may replace.
 RUN_FILES = ("stream.gss", "metrics.jsonl", "recipe.yaml")
-#: What is made from a finished run; a new run would make it anew or leave a stale one behind.
+#: Files that are made from a finished run; a new run removes them, lest files of the old run stay behind.
 MADE_FILES = ("contact_sheet.png", "frames.png", "summary.txt", "video.mp4", "gap.txt", "gap.json")
 
 

@@ -74,7 +74,7 @@ class StreamState:
     #: The first frame as it goes on being optimised beside the stream; None before the frame after it, from the key
     #: packet on that brings it, and when the recipe asks for none.
     refinement: Refinement | None = None
-    #: What the motion part remembers of the packets since the last key packet (``MotionPart.follow``).
+    #: State of the motion part after the packets since the last key packet (``MotionPart.follow``).
     motion_memory: Any = None
     #: What the renderer keeps of this scene from one frame to the next. Nothing but time depends on it: a state
     #: without one (the first, a resumed one) goes on to the same bytes.

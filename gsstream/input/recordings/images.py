@@ -24,7 +24,7 @@ _READABLE = "8-bit JPEG or PNG, or 16-bit PNG, without transparency"
 
 
 def told_apart(path: Path) -> str:
-    """Return what to do about a file that no decoder takes; what phones write is known by its first bytes."""
+    """Return the cure for a file that no decoder reads; formats of phones are known by their first bytes."""
     with path.open("rb") as file:
         head = file.read(12)
     if head[4:8] == b"ftyp":

@@ -1,4 +1,4 @@
-"""The motions of a delta packet: section motion. Which groups move is coded as runs, what corrects them as symbols."""
+"""The motions of a delta packet (section motion): moving groups coded as runs, their corrections as symbols."""
 
 from __future__ import annotations
 

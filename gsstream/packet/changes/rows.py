@@ -73,7 +73,7 @@ def encode_removed(removed: IntArray, number: int) -> bytes:
 
 
 def decode_removed(data: bytes, number: int) -> IntArray:
-    """Decode what :func:`encode_removed` wrote. Raises PacketError (without offset)."""
+    """Decode the rows that :func:`encode_removed` wrote. Raises PacketError (without offset)."""
     gone, levels = decode_gates(data, number)
     if levels != 1 or not gone.any():
         raise PacketError("removed: no row leaves, or rows leave by levels")

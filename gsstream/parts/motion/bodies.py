@@ -78,7 +78,7 @@ def _joined(pairs: IntArray, motion: FloatArray, weight: FloatArray, most: float
         pairs, costs = np.stack(np.divmod(names, number), 1), costs[which]
         apart = pairs[:, 0] != pairs[:, 1]
         pairs, costs = pairs[apart], costs[apart]
-        # Only what has just been joined costs something else than before.
+        # Costs change only for pairs of which one body has just been joined.
         new = np.isin(pairs, kept).any(1)
         costs[new] = _costs(pairs[new], motion, weight)
     return first, motion
@@ -88,7 +88,7 @@ def _best_of_both(pairs: IntArray, costs: FloatArray, number: int) -> IntArray:
     """[E] bool: pairs that are the cheapest of both their ends; no end is in two of them, whatever costs the same."""
     order = np.argsort(-costs, kind="stable")
     best = np.zeros(number, np.int64)
-    # Of several values for one place the last one stays, that of the cheapest pair.
+    # Where several values are written to one place, the last one stays: the value of the cheapest pair.
     best[pairs[order].ravel()] = np.repeat(order, 2)
     return np.asarray((best[pairs] == np.arange(len(pairs))[:, None]).all(1))
 

@@ -112,7 +112,7 @@ class Rigid(MotionPart):
         config = self.config
         total = work.scaled(config.epochs * len(work.cameras))
         damping = Damping(DAMPING, config.hold, LONGEST * enlargement(work.cameras.width))
-        # What noise adds to a sum of so many values grows as the root of their number.
+        # The part of noise in a sum of so many values grows as the root of their number.
         values = 3 * work.cameras.height * work.cameras.width * len(work.cameras)
         bodies = BodySettings(config.body_cost * values**0.5, BODY_HOLD)
         order = rng.numpy("motion", work.index)

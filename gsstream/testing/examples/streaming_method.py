@@ -28,7 +28,7 @@ SH0 = 0.2820948
 
 @dataclass(frozen=True)
 class Carried:
-    """What goes from frame to frame; here nothing but what every player has."""
+    """State from frame to frame; here only the state of every player."""
 
     player: PlayerState
 

@@ -1,4 +1,4 @@
-"""Fitting key points to the images, and saying their field as rigid motions of small cells."""
+"""Motion by key points: the fit to the images, and the rigid motions of small cells that come near to their field."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ def cell_sides(means: FloatArray, levels: int, per_cell: float) -> list[float]:
 def _warm_started(
     scene: Scene, start: Scene, transforms: GroupTransforms[FloatArray], momentum: float
 ) -> GroupTransforms[FloatArray]:
-    """Transforms that begin with a share of the last frame's motion, less what coarser cells have moved by already."""
+    """Return transforms that begin with a share of the last motion, less the motion by which coarser cells moved."""
     if start.displacement is None or momentum == 0:
         return transforms
     past: FloatArray = np.zeros((len(scene.gaussians), 3))

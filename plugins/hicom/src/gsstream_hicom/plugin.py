@@ -7,7 +7,7 @@ from gsstream.spec import ComponentSpec, MethodSpec, hookimpl
 
 @hookimpl
 def gsstream_components() -> list[ComponentSpec]:
-    """The motion; what is added and removed is the growth part ``copies``."""
+    """Declare the motion; Gaussians are added and removed by the growth part ``copies``."""
     return [
         ComponentSpec(
             kind="motion",
@@ -20,7 +20,7 @@ def gsstream_components() -> list[ComponentSpec]:
 
 @hookimpl
 def gsstream_methods() -> list[MethodSpec]:
-    """The letter, and what it costs less to do."""
+    """Declare the method and its variants."""
     return [
         MethodSpec(
             name="hicom",

@@ -1,4 +1,4 @@
-"""Confidence from a network that sees the two frames: how much of what a Gaussian covers has changed."""
+"""Confidence from a network that sees the two frames: the changed share of a Gaussian's pixels."""
 
 from __future__ import annotations
 

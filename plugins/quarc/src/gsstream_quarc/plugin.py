@@ -7,7 +7,7 @@ from gsstream.spec import ComponentSpec, MethodSpec, hookimpl
 
 @hookimpl
 def gsstream_components() -> list[ComponentSpec]:
-    """The growth; the motion is that of ReCon-GS, rounded."""
+    """Declare the growth part; the motion is the part of ReCon-GS with rounded motions."""
     return [
         ComponentSpec(
             kind="growth",
@@ -20,7 +20,7 @@ def gsstream_components() -> list[ComponentSpec]:
 
 @hookimpl
 def gsstream_methods() -> list[MethodSpec]:
-    """The letter, and what it costs less to do."""
+    """Declare the method and its variants."""
     return [
         MethodSpec(
             name="quarc",

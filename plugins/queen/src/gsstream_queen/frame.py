@@ -137,7 +137,7 @@ class _Frame:
         self._open()
 
     def _open(self) -> None:
-        """A session of the scene without what is gone and with what was added."""
+        """Return a session of the scene without removed and with added Gaussians."""
         added = [rows.values().map(torch.Tensor.detach) for rows in self._new]
         scene = concat([self._scene.rows(~self._gone), *added])
         trained = torch.zeros(len(self._scene), dtype=torch.bool)

@@ -39,5 +39,5 @@ def gates(logits: torch.Tensor, settings: GateSettings) -> torch.Tensor:
 
 
 def open_probability(logits: torch.Tensor, settings: GateSettings) -> torch.Tensor:
-    """[N] probability that a gate with noise would not be 0: what L0 counts."""
+    """Return [N]: the probability that a gate with noise is not 0, which the L0 penalty sums."""
     return torch.sigmoid(logits - open_logit(settings))

@@ -30,7 +30,7 @@ def coded(policies: Mapping[str, LatentPolicy], gaussians: Gaussians[torch.Tenso
 
 
 def initial_weights(policies: Mapping[str, LatentPolicy], gaussians: Gaussians[torch.Tensor], rng: Rng) -> Tensors:
-    """Attribute -> what is learned of its decoder: all entries [L, D], or one number [1, 1] (cosine)."""
+    """Attribute -> learned numbers of its decoder: all entries [L, D], or one number [1, 1] (cosine)."""
     found = {}
     for name, policy in coded(policies, gaussians).items():
         shape = (policy.latent, width(gaussians, name)) if name not in COSINE else (1, 1)

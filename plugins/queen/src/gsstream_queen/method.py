@@ -142,7 +142,7 @@ class Queen(StreamingMethod[QueenState]):
 
 
 def added_of(added: Gaussians[torch.Tensor], nodes: int) -> AddedGaussians | None:
-    """Each new Gaussian is a node of its own, behind the old ones."""
+    """Return Gaussians to add, each a node of its own after the old nodes; None without any."""
     if len(added) == 0:
         return None
     own = nodes + np.arange(len(added), dtype=np.int64)

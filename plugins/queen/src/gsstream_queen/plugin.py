@@ -20,7 +20,7 @@ def gsstream_components() -> list[ComponentSpec]:
 
 @hookimpl
 def gsstream_methods() -> list[MethodSpec]:
-    """The letter, and what it costs less to do."""
+    """Declare the method and its variants."""
     return [
         MethodSpec(
             name="queen",

@@ -30,7 +30,7 @@ class LatentPolicy(PartConfig):
 
 
 class ChangeSettings(PartConfig):
-    """The view-space gradient difference, and from what on a Gaussian counts as dynamic."""
+    """The view-space gradient difference, and its threshold above which a Gaussian is dynamic."""
 
     loss: Literal["mse", "l2norm"] = Field(
         default="mse", description="E; mse: published; l2norm: mean Euclidean distance of pixel colours"
@@ -58,7 +58,7 @@ class GateSettings(PartConfig):
 
 
 class MaskSettings(PartConfig):
-    """The first part of a frame looks only at what changed."""
+    """The first iterations of a frame compare only the tiles that changed."""
 
     share: float = Field(default=0.3, ge=0, le=1, description="share of a frame's iterations that are masked, 0 to 1")
 
@@ -82,7 +82,7 @@ class GrowthSettings(PartConfig):
 
 
 class QueenConfig(PartConfig):
-    """Everything that can be told to the method."""
+    """All settings of the method."""
 
     means: PositionPolicy = Field(default=PositionPolicy(), description="centres")
     quats: LatentPolicy = Field(default=LatentPolicy(latent=6, lr=0.025), description="raw quaternions")

@@ -59,7 +59,7 @@ def bound(centres: FloatArray, means: FloatArray, anchors: AnchorLevels) -> list
 
 
 def inherited(past: FloatArray, old: list[Level], new: list[Level], neighbours: int) -> list[FloatArray]:
-    """Return the motion [K, 6] of the anchors of every level of ``new`` that says the past motion of cells.
+    """Return the motions [K, 6] of the anchors on every level of ``new`` that give cells their past motion.
 
     The coarsest level says the mean of its cells, each finer one the mean of what is left. An anchor that was drawn
     anew takes the mean of the nearest old ones of its level, weighed by one over the distance.

@@ -1,4 +1,4 @@
-"""Motion by anchors on several levels: fitting their motions to the images, and saying what they add up to."""
+"""Motion by anchors on several levels: the fit to the images, and the sums of motions that are sent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Expected sparsity: pay for every gate that may open, and for what moves behind it."""
+"""Expected sparsity: a penalty on the probability of open gates, and on motions behind open gates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Uniform-random confidence: suspicion by lot."""
+"""Uniform-random confidence: a random logit for every Gaussian."""
 
 from __future__ import annotations
 

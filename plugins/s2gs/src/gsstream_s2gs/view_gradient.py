@@ -109,7 +109,7 @@ class ViewSpaceGradient(ConfidenceEstimator):
     def estimate(self, context: FrameContext) -> torch.Tensor:
         """Logits [N] float32 in [-LIMIT, LIMIT]. Raises ShapeError when a gradient is not finite."""
         config = self.config
-        # Where it does not matter which Gaussians are seen, those that a change reaches are all there is to look at.
+        # Where the result does not depend on which Gaussians are seen, only those that a change reaches are computed.
         few = config.aggregate == "mean-vector" and config.statistics == "touched" and config.normalisation != "noise"
         rows, magnitude, expected, seen = self._reached(context) if few else (None, *self._magnitudes(context))
         number = len(context.gaussians.means)
@@ -127,7 +127,7 @@ class ViewSpaceGradient(ConfidenceEstimator):
             chosen = minmax(values, LIMIT)
         else:
             chosen = noise_units(values, expected[seen], NOISE_THRESHOLD, config.floor)
-        # Whatever a change touches is never less likely to change than what it does not touch.
+        # A Gaussian that a change touches never gets a lower logit than one that no change touches.
         least = config.floor if config.statistics == "touched" else -LIMIT
         logits[seen if rows is None else rows[seen]] = chosen.clamp(least, LIMIT)
         return logits.float()

@@ -10,7 +10,7 @@ from torch import nn
 
 from gsstream.api import Field, FieldShape, FloatArray, IntArray
 
-#: What a whole number of the packet's stands for: of an entry, of a weight.
+#: Value of one unit of the packet's whole numbers, of an entry and of a weight.
 ENTRY_UNIT, WEIGHT_UNIT = 2.0**-20, 2.0**-14
 BETAS, EPSILON = (0.9, 0.999), 1e-8
 
@@ -70,7 +70,7 @@ class Cache:
         self._count = 0
 
     def symbols(self) -> list[torch.Tensor]:
-        """Return what was learned in whole quantisation steps: the table, then each layer."""
+        """Return the learned changes in whole quantisation steps: of the table, then of each layer."""
         return [(value.detach() / step).round() for value, step in zip(self.learned, self.steps, strict=True)]
 
     def __call__(self, rounded: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
@@ -103,7 +103,7 @@ class Cache:
             value.grad = None
 
     def field(self, marks: IntArray | None) -> Field:
-        """Return the change of a frame that says what was learned."""
+        """Return the change of a frame with the learned weights."""
         table, *layers = (symbols.numpy().astype(np.int32) for symbols in self.symbols())
         ends = np.cumsum([len(which) for which in self.lookup.touched])[:-1]
         entries = tuple(np.split(table, ends))

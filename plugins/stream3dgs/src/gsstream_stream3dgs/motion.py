@@ -1,4 +1,4 @@
-"""Motion by a transformation cache: fitting it to the images of a frame, and saying what it does."""
+"""Motion by a transformation cache: the fit to the images of a frame, and the change that is sent."""
 
 from __future__ import annotations
 

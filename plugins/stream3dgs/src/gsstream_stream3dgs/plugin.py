@@ -7,7 +7,7 @@ from gsstream.spec import ComponentSpec, MethodSpec, hookimpl
 
 @hookimpl
 def gsstream_components() -> list[ComponentSpec]:
-    """The motion; what a frame adds for itself is the growth part ``copies``."""
+    """Declare the motion; the Gaussians that a frame adds come from the growth part ``copies``."""
     return [
         ComponentSpec(
             kind="motion",

@@ -47,5 +47,5 @@ def label_of(path: Path) -> str | None:
 
 
 def hint(path: Path) -> str:
-    """Return what to say when there is no file ``path`` but a recipe of that name is shipped; else nothing."""
+    """Return advice when there is no file ``path`` but a recipe of that name is shipped; else an empty text."""
     return f"; a recipe of this name comes with gsstream: --recipe {SCHEME}{path.stem}" if path.stem in names() else ""

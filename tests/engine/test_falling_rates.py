@@ -19,7 +19,7 @@ from gsstream.parts.optimiser.adam import ReferenceAdam
 from gsstream.parts.optimiser.base import AdamState
 from gsstream.parts.optimiser.joint import JointResidualOptimiser
 from gsstream.parts.optimiser.residual import ResidualOptimiser
-from gsstream.testing.optimiser.checks import _residual_case
+from gsstream.testing.optimiser.checks import residual_case
 
 FACTORS = (1.0, 0.5, 0.01)
 
@@ -61,7 +61,7 @@ def native(*case: Any) -> ResidualOptimiser:
 @pytest.mark.parametrize("make", [joint, native])
 def test_a_factor_does_what_smaller_rates_do(make: Callable[..., ResidualOptimiser]) -> None:
     """Of latents and of decoders: a table whose rates are a quarter, and one that is told so in every step."""
-    code, *rest = _residual_case()
+    code, *rest = residual_case()
     slow = replace(code, lrs=0.25 * code.lrs, decoder_lrs=0.25 * code.decoder_lrs)
     assert trained(make(code, *rest), [0.25] * 3) == trained(make(slow, *rest), [None] * 3)
     assert trained(make(code, *rest), [1.0] * 3) == trained(make(code, *rest), [None] * 3)
@@ -70,7 +70,7 @@ def test_a_factor_does_what_smaller_rates_do(make: Callable[..., ResidualOptimis
 
 def test_a_step_that_is_told_nothing_has_the_bits_of_the_optimiser_alone() -> None:
     """What a frame did before there was a factor: the optimiser's own step, with the rates of the code."""
-    code, *rest = _residual_case()
+    code, *rest = residual_case()
     table, optimiser = JointResidualOptimiser(code, *rest, ReferenceAdam()), ReferenceAdam()
     values = {"latents": table.latents.detach().clone(), "matrix": table.matrix.clone()}
     states = {name: AdamState.start(value) for name, value in values.items()}

@@ -38,10 +38,10 @@ class RunListener:
     """Told of every frame of a run; does nothing unless a subclass says otherwise."""
 
     def before(self) -> None:
-        """Start what is measured: a frame's images are in memory, and it is encoded next."""
+        """Start a measurement: the images of a frame are in memory, and the frame is encoded next."""
 
     def after(self, step: EncodedFrame) -> Mapping[str, Any]:
-        """Return what is to stand in the frame's line of metrics, too; its packet is written already."""
+        """Return further entries of the frame's line of metrics; the packet of the frame is written already."""
         return {}
 
 
@@ -129,7 +129,7 @@ class _Run:
         self.written = 0.0
 
     def prepare(self, resume: bool) -> int:
-        """Go on after what the folder holds, or write the recipe into it; return the first frame to encode."""
+        """Resume the stream in the folder, or write the recipe of a new one; return the first frame to encode."""
         last = self._resume() if resume else None
         if last is None:
             # Before the first packet: a packet without this file would be one that nobody misses a line of.
@@ -142,7 +142,7 @@ class _Run:
         return last + 1
 
     def record(self, step: EncodedFrame, train: Frame, test: Frame, numbers: Mapping[str, Any]) -> None:
-        """Write down what a frame cost and how good it is."""
+        """Write the cost and the quality of a frame to the metrics file."""
         metrics = {**step.metrics, **numbers, "live": live_metrics(train, self.written)}
         metrics["displacement_pixels"] = displacement_pixels(step.state.player, train.cameras)
         # A run that is behind does not spend time on the quality of frames that it drops: ``evaluate`` measures it.
@@ -171,7 +171,7 @@ class _Run:
         return points
 
     def _resume(self) -> int | None:
-        """Go on after what the folder holds; the last frame of that, or None to begin anew."""
+        """Resume the stream in the folder; return its last frame, or None when the stream begins anew."""
         stream, log = self.out / STREAM, self.out / METRICS
         planned = self.encoder.controller.budget.limits_frames
         # A kill between a packet and its line leaves a frame that no table would count, and that a budget would plan

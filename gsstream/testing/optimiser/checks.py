@@ -98,8 +98,8 @@ def check_optimiser_refuses(part: RowOptimiser) -> None:
         raise AssertionError(f"a gradient of shape {list(wrong.shape)}, first value {wrong.flatten()[0]}, was accepted")
 
 
-def _residual_case() -> tuple[JointLayout, Gaussians[torch.Tensor], torch.Tensor, torch.Tensor]:
-    """300 rows of which positions change directly, in units, and sizes and colours through decoders."""
+def residual_case() -> tuple[JointLayout, Gaussians[torch.Tensor], torch.Tensor, torch.Tensor]:
+    """Return layout, scene, units and decoders of 300 rows: positions change directly, sizes and colours by decoders."""
     g = torch.Generator().manual_seed(7)
     shapes = (3,), (4,), (3,), (), (1, 3), (3, 3)
     base = Gaussians(*(torch.randn(300, *shape, generator=g) for shape in shapes))
@@ -123,7 +123,7 @@ def check_residual_optimiser(part: RowOptimiser) -> None:
 
     Rows leave, bits cost something in every other step, and the learning rates fall.
     """
-    code, base, units, matrix = _residual_case()
+    code, base, units, matrix = residual_case()
     subject = part.residual_optimiser(code, base, units, matrix)
     truth = JointResidualOptimiser(code=code, base=base, units=units, matrix=matrix, optimiser=part)
     g, rows = torch.Generator().manual_seed(8), len(base)

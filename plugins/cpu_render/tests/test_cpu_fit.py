@@ -36,7 +36,7 @@ from gsstream.api import (
 from gsstream.parts.loss.photometric import ReferenceLoss
 from gsstream.parts.render.base import TILE
 from gsstream.parts.render.transforms import transform_rows, transform_vjp
-from gsstream.testing.optimiser.checks import _residual_case
+from gsstream.testing.optimiser.checks import residual_case
 
 BACKGROUND = (0.2, 0.5, 0.9)
 ROWS = torch.tensor([1, 2, 5, 8, 11, 13, 17])
@@ -247,7 +247,7 @@ def test_what_does_not_fit_is_refused() -> None:
 
 
 def test_the_residual_table_refuses_gradients_of_other_rows_and_a_step_without_a_backward() -> None:
-    code, base, units, matrix = _residual_case()
+    code, base, units, matrix = residual_case()
     table = CpuAdam().residual_optimiser(code, base, units, matrix)
     table.forward(torch.ones(300))
     with pytest.raises(ShapeError, match="gradient of means: expected shape"):

@@ -24,7 +24,7 @@ from test_cpu_renderer import rig, scene
 from test_native_loss import near_pair
 
 from gsstream.api import AdamState, Gaussians, WrtScene
-from gsstream.testing.optimiser.checks import _residual_case
+from gsstream.testing.optimiser.checks import residual_case
 
 
 def rasterised() -> list[Any]:
@@ -51,7 +51,7 @@ def whole_scene() -> list[Any]:
 
 
 def residual_table() -> list[Any]:
-    code, base, units, matrix = _residual_case()
+    code, base, units, matrix = residual_case()
     base, units = base.rows(torch.arange(300).repeat(5)), units.repeat(5)
     table, g = CpuAdam().residual_optimiser(code, base, units, matrix), torch.Generator().manual_seed(5)
     for _ in range(3):

@@ -112,7 +112,7 @@ def _cameras(playback: Playback, wanted: str | None) -> list[str | None]:
 
 
 def named_recording(file: Path, meta: StreamMeta, catalog: Catalog) -> str:
-    """Return the recording that a stream says it was made from, as far as a file may decide that.
+    """Return the recording named in a stream, if a file from a stranger may choose this recording.
 
     Folders, the demo and synthetic scenes are read as they are. What waits (watch:) or is opened by a plugin is only
     opened when the user names it. Raises InputError.

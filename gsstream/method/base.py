@@ -1,4 +1,4 @@
-"""StreamingMethod: the one interface to a method. What it sends is played by every player.
+"""StreamingMethod: the one interface to a method. Its packets are played by every player.
 
 A method is given a frame and what the engine can do (``Tools``), and returns a packet and the state it goes on from.
 The engine keeps the rest: recordings, recipes, the stream on disk, metrics, resume. The method made of parts is

@@ -109,7 +109,7 @@ def _key_step(
     *,
     layered: bool = False,
 ) -> Step:
-    """A key packet of Gaussians on its grids, of these levels, which show the pictures of the frame ``shown``.
+    """Return the key packet of Gaussians of these levels, on the packet's grids, fitted to the pictures of ``shown``.
 
     A periodic one has no layers: a player that continues needs none, and to find them would cost the frame time.
     """

@@ -139,7 +139,7 @@ def select(assembly: Assembly, work: EngineContext, hierarchy: Hierarchy, scope:
     return Selected(candidates(able, open_probability, hierarchy, assembly.recipe.stream.active_threshold), logits)
 
 
-#: Share of the rows that a frame may change where what the renderer keeps of the others pays.
+#: Largest share of changed rows at which the renderer's cache of the other rows saves time.
 MOST_CHANGED = 0.5
 
 

@@ -26,7 +26,7 @@ from gsstream.input.seeds.sweep import SweepSettings, agreements
 #: Width of the pictures that are swept, and how many of them are.
 WIDTH, VIEWS = 64, 3
 SETTINGS = SweepSettings(planes=16, neighbours=3, windows=(2,), workers=1)
-#: Matching cost that counts as the same. Right poses of five recordings: 0.30 to 0.50 of the texture agrees; wrong
+#: Matching cost up to which texture agrees. Right poses of five recordings: 0.30 to 0.50 of the texture agrees; wrong
 #: ones: at most 0.11, and at most a third of what the right ones reach.
 SAME, AGREED, TIMES = 0.15, 0.25, 2.5
 LEAST = 0.15

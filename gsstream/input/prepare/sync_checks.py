@@ -1,4 +1,4 @@
-"""Do all cameras show the same instants? What moves on epipolar lines is compared between cameras, earlier and later.
+"""Do all cameras show the same instants? Motion on epipolar lines is compared between cameras at shifted times.
 
 A camera that is most like all others some frames earlier or later has a clock that is off; two cameras that are like
 the others only with each other's pose are swapped. Where motion is too little, or too steady, to tell, that is said.

@@ -99,7 +99,7 @@ def check_optimiser_refuses(part: RowOptimiser) -> None:
 
 
 def residual_case() -> tuple[JointLayout, Gaussians[torch.Tensor], torch.Tensor, torch.Tensor]:
-    """Return layout, scene, units and decoders of 300 rows: positions change directly, sizes and colours by decoders."""
+    """Return layout, rows, units and decoders of 300 rows: centres change directly, sizes and colours by decoders."""
     g = torch.Generator().manual_seed(7)
     shapes = (3,), (4,), (3,), (), (1, 3), (3, 3)
     base = Gaussians(*(torch.randn(300, *shape, generator=g) for shape in shapes))

@@ -87,6 +87,10 @@ _COMMANDS = {
         "recipe": ("recipe:recipe", "Print a method's recipe as YAML, with the provenance of every value."),
         "plugins": ("plugins:plugins", "List all plugins and the parts they ship, or show one part."),
         "check": ("check:check", "Check that a part, a method, or everything in a plugin keeps its contract."),
+        "conformance": (
+            "conformance:conformance",
+            "Play the streams of the conformance suite with a decoder, and compare the hash of every frame.",
+        ),
         "new-plugin": ("scaffold:new_plugin", "Write a distribution with one working part, its test and README."),
     },
 }

@@ -58,10 +58,11 @@ OPTIONS = {
     "gsstream plugins": ["PART", "--check"],
     "gsstream doctor": [],
     "gsstream check": ["NAME", "--quiet", "--set", "--source"],
+    "gsstream conformance": ["--program", "--vectors"],
     "gsstream new-plugin": ["NAME", "--kind", "--out"],
 }  # fmt: skip
 #: Most of each that gsstream itself may have; what measures is in gsstream-lab.
-COMMANDS, ALL_OPTIONS = 14, 70
+COMMANDS, ALL_OPTIONS = 15, 71
 
 
 @pytest.fixture(autouse=True)

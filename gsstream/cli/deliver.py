@@ -10,6 +10,7 @@ import typer
 from gsstream.cli.listing import plural
 from gsstream.cli.streams import Frames, MaxMemory, Stream, fail_with, frame_range, progress_on, size_of, stream_file
 from gsstream.core.errors import InputError, OutputError
+from gsstream.core.memory import limited_memory
 
 
 def export(
@@ -50,7 +51,8 @@ def export(
     if kind == "page":
         if frames is not None:
             raise InputError(f"--frames {frames}: a page holds all frames of a stream; leave --frames out")
-        _page(file, out, [stream_file(path) for path in rendition or []], join_every)
+        with limited_memory(most):
+            _page(file, out, [stream_file(path) for path in rendition or []], join_every)
         return
     if rendition:
         raise InputError("--rendition is for --format page")

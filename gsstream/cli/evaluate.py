@@ -22,6 +22,7 @@ from gsstream.cli.streams import (
     stream_file,
 )
 from gsstream.core.errors import InputError
+from gsstream.core.memory import limited_memory
 
 if TYPE_CHECKING:
     from gsstream.evaluation.evaluate import Evaluation
@@ -118,8 +119,8 @@ def evaluate(
     with Playback(file, max_memory=size_of(max_memory)) as playback:
         meta = playback.meta
         frames, damage = playback.sound(*frame_range(measured.frames))
-        if playback.limit is not None:
-            playback.limit.check_pictures(meta.test.width, meta.test.height, len(meta.test))
+        playback.limit.check_pictures(meta.test.width, meta.test.height, len(meta.test))
+        if max_memory is not None:
             for frame in frames:
                 playback.state_at(frame)
     catalog = load_catalog()
@@ -129,7 +130,8 @@ def evaluate(
     try:
         # Another writer may leave the recipe empty.
         measured.fits(recording.info, meta.recipe.get("data", {}).get("leak", "none"), frames)
-        evaluation = evaluate_stream(file, recording, frames=frames, lpips=lpips, progress=progress_on("frame"))
+        with limited_memory(size_of(max_memory)):
+            evaluation = evaluate_stream(file, recording, frames=frames, lpips=lpips, progress=progress_on("frame"))
     finally:
         recording.close()
     measured.show(evaluation)

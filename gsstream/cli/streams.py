@@ -26,7 +26,9 @@ Frames = Annotated[
 
 MaxMemory = Annotated[
     str | None,
-    typer.Option("--max-memory", metavar="SIZE", help="Refuse what would take more, e.g. 500MB; default: no limit."),
+    typer.Option(
+        "--max-memory", metavar="SIZE", help="Refuse what would take more, e.g. 500MB; default: half of the memory."
+    ),
 ]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import FileIO
@@ -38,6 +39,8 @@ class TruncatedTail:
 class StreamReader:
     """Reads a stream file; also one that is still growing (:meth:`refresh`).
 
+    Several threads may :meth:`read` at the same time; :meth:`refresh` and :meth:`close` are of one thread alone.
+
     ``entries`` lists the complete packets in file order. What stops the walk is kept, not raised, so that the frames
     before it can be played: ``unfinished`` for a packet cut short at the end of the file, ``damage`` (a PacketError
     with its byte offset) for anything else. :meth:`check` raises it.
@@ -52,12 +55,13 @@ class StreamReader:
             self._file: FileIO = self.path.open("rb", buffering=0)
         except OSError as error:
             raise SourceError(f"cannot open the stream {self.path}: {error.strerror}; expected a .gss file") from error
+        self._lock = threading.Lock()
         self.entries: list[Entry] = []
         self.unfinished: TruncatedTail | None = None
         self.damage: PacketError | None = None
         try:
             #: Format version of the file, "major.minor".
-            self.version = check_file_header(self._file.read(FILE_HEADER.size))
+            self.version = check_file_header(self._read_at(0, FILE_HEADER.size))
         except PacketError:
             self._file.close()
             raise
@@ -101,8 +105,7 @@ class StreamReader:
 
     def _entry_at(self, offset: int, total: int) -> Entry | None:
         """The packet at ``offset``, or None when the file ends before it does."""
-        self._file.seek(offset)
-        head = self._file.read(PACKET_HEADER.size)
+        head = self._read_at(offset, PACKET_HEADER.size)
         if len(head) < PACKET_HEADER.size:
             return None
         header = parse_header(head, offset)
@@ -114,12 +117,19 @@ class StreamReader:
 
     def read(self, entry: Entry) -> bytes:
         """Return all bytes of a packet, checksum verified. Raises PacketError."""
-        self._file.seek(entry.offset)
-        data = self._file.read(entry.size)
+        data = self._read_at(entry.offset, entry.size)
         if len(data) != entry.size:
             raise PacketError(f"packet of {entry.size} bytes: the file holds {len(data)} of them", entry.offset)
         parse_packet(data, entry.offset)
         return data
+
+    def _read_at(self, offset: int, size: int) -> bytes:
+        """Bytes of the file, fewer where it ends. The place that threads and forked processes share is not moved."""
+        if hasattr(os, "pread"):
+            return os.pread(self._file.fileno(), size, offset)
+        with self._lock:  # a system without it
+            self._file.seek(offset)
+            return self._file.read(size)
 
     def __iter__(self) -> Iterator[tuple[Entry, bytes]]:
         """Every packet in order. Raises the damage, if any, after the last good one."""

@@ -11,23 +11,27 @@ from dataclasses import dataclass
 
 import zstandard
 
-from gsstream.core.errors import InputError
+from gsstream.core.memory import limited_memory, require_memory
 from gsstream.packet import PacketKind, PlayerState
 from gsstream.packet.base import MAX_META, Section, add_offset, parse_packet
 from gsstream.packet.bits import BitReader, unpack_blobs
+from gsstream.player.render import PER_PIXEL
 
 #: Bytes at the peak for every number of a Gaussian in a key packet or an added Gaussian (4 of them stay), for every
-#: Gaussian that a delta reaches, for every byte of meta as JSON (lists of empty objects are worst), and for every
-#: pixel.
-PER_NUMBER, PER_DELTA_ROW, PER_META_BYTE, PER_PIXEL = 30, 200, 30, 48
+#: Gaussian that a delta reaches, and for every byte of meta as JSON (lists of empty objects are worst).
+PER_NUMBER, PER_DELTA_ROW, PER_META_BYTE = 30, 200, 30
 _COUNTS = struct.Struct("<II")
 
 
 @dataclass(frozen=True, slots=True)
 class MemoryLimit:
-    """A limit in bytes on the memory for a stream, beside the program itself (about 80 MB)."""
+    """A limit in bytes on the memory for a stream, beside the program itself (about 80 MB).
 
-    most: int
+
+    None: what :func:`gsstream.core.memory.memory_limit` says.
+    """
+
+    most: int | None = None
 
     def check_packet(self, size: int, frame: int) -> None:
         """Refuse a packet of ``size`` bytes before it is read. Raises InputError."""
@@ -53,15 +57,8 @@ class MemoryLimit:
         self._check(width * height * (PER_PIXEL + 3 * kept), f"drawing {width} x {height} pixels")
 
     def _check(self, wanted: int, what: str) -> None:
-        if wanted > self.most:
-            raise InputError(
-                f"{what} takes about {_mb(wanted)} MB; the limit is {_mb(self.most)} MB. Raise --max-memory "
-                "if you trust this stream"
-            )
-
-
-def _mb(size: int) -> str:
-    return f"{size / 1e6:,.0f}" if size >= 10_000_000 else f"{size / 1e6:.3g}"
+        with limited_memory(self.most):
+            require_memory(wanted, what)
 
 
 def _key(sections: dict[str, Section]) -> int:

@@ -16,6 +16,7 @@ from PIL import Image
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError, OutputError
 from gsstream.core.install_hints import install_extra
+from gsstream.core.memory import limited_memory
 from gsstream.core.shapes import FloatArray
 from gsstream.player.camera_file import read_path
 from gsstream.player.interpolation import Moments, frame_times
@@ -56,7 +57,7 @@ def play(
     (without ``frames``: once the pictures before the damage are written), OutputError when ``out`` cannot be written.
     """
     check_target(Path(out))
-    with Playback(stream, max_memory=max_memory) as playback:
+    with limited_memory(max_memory), Playback(stream) as playback:
         sound, damage = playback.sound() if frames is None else (frames, None)
         chosen = list(sound)
         if not chosen:
@@ -67,9 +68,8 @@ def play(
         times = frame_times(chosen, playback.meta.fps, rate) if fps is not None else [float(frame) for frame in chosen]
         cameras = choose_cameras(playback, camera, len(times))
         cameras = cameras if size is None else resized(cameras, *size)
-        if playback.limit is not None:
-            kept = len(times) if Path(out).suffix.lower() in _ANIMATED else 1
-            playback.limit.check_pictures(cameras.width, cameras.height, kept)
+        kept = len(times) if Path(out).suffix.lower() in _ANIMATED else 1
+        playback.limit.check_pictures(cameras.width, cameras.height, kept)
         images = _images(playback, times, cameras, renderer=renderer, progress=progress)
         try:
             played = write_pictures(Path(out), images, chosen if fps is None else range(len(times)), rate)

@@ -21,16 +21,21 @@ class TruncatedStreamWarning(UserWarning):
 
 
 class Playback:
-    """A stream seen as scenes by frame index. Stepping forward decodes one packet; seeking starts at a key packet."""
+    """A stream seen as scenes by frame index. Stepping forward decodes one packet; seeking starts at a key packet.
+
+    Several threads may ask one Playback for scenes: every answer is right, though threads that ask for places far apart
+    make each other decode more; a Playback for each thread is faster. :meth:`refresh` and :meth:`close` are of one
+    thread alone.
+    """
 
     def __init__(self, path: str | os.PathLike[str], *, max_memory: int | None = None) -> None:
-        """Open a stream.
+        """Open a stream. ``max_memory``: bytes that playing it may take; None: see ``gsstream.core.memory``.
 
         Raises SourceError when there is no stream, PacketError when its first packet is not readable, InputError when
         it would take more memory than allowed; so do all methods that decode.
         """
         self.reader = StreamReader(path)
-        self.limit = None if max_memory is None else MemoryLimit(max_memory)
+        self.limit = MemoryLimit(max_memory)
         try:
             if not self.reader.frames:
                 raise self.reader.damage or PacketError("the stream holds no complete packet yet", self.reader.end)
@@ -99,8 +104,7 @@ class Playback:
             self.entry(stop - 1)
         for entry in self._entries[self._key_before(start) - first : None if stop is None else max(0, stop - first)]:
             try:
-                if self.limit is not None:
-                    self.limit.check_packet(entry.size, entry.frame)
+                self.limit.check_packet(entry.size, entry.frame)
                 self.reader.read(entry)
             except PacketError as error:
                 if entry.frame <= start:
@@ -129,8 +133,9 @@ class Playback:
         self.entry(frame)
         first, start = self.frames[0], self._key_before(frame)
         state: PlayerState | None = None
-        if start <= self._state.frame <= frame:
-            state, start = self._state, self._state.frame + 1
+        held = self._state  # read once: another thread may change it
+        if start <= held.frame <= frame:
+            state, start = held, held.frame + 1
         for entry in self._entries[start - first : frame - first + 1]:
             state = self._state = self._decode(state, entry)
         assert state is not None
@@ -154,8 +159,6 @@ class Playback:
         return keys[bisect_right(keys, frame) - 1]
 
     def _decode(self, state: PlayerState | None, entry: Entry) -> PlayerState:
-        if self.limit is None:
-            return decode_packet(state, self.reader.read(entry), offset=entry.offset)
         self.limit.check_packet(entry.size, entry.frame)
         data = self.reader.read(entry)
         self.limit.check_decoding(data, state, entry.offset)

@@ -6,7 +6,8 @@ A plugin offers one by an entry point of the group ``gsstream.player``::
     mine = "gsstream_mine.rasterizer:render_numpy"
 
 The first name in the alphabet is used, unless ``gsstream play --renderer NAME`` names another. ``render_numpy`` is
-a function that can be called like :func:`gsstream.player.software.render_numpy`, in a module that needs no torch.
+a function that can be called like :func:`gsstream.player.software.render_numpy`, in a module that needs no torch. One
+that has a parameter ``max_memory`` is given the bytes that it may take, and raises MemoryError before it takes more.
 """
 
 from __future__ import annotations
@@ -21,13 +22,16 @@ from typing import NamedTuple
 import numpy as np
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.errors import PluginUnavailable, UnknownName
+from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.install_hints import install_renderer
+from gsstream.core.memory import VARIABLE, memory_limit, require_memory
 from gsstream.core.shapes import FloatArray, check_finite, check_shape
 from gsstream.player.software import render_numpy
 
 ENTRY_POINT_GROUP = "gsstream.player"
+#: Bytes of memory at the peak for every pixel of a picture, measured.
+PER_PIXEL = 48
 
 
 class PlayerRenderer(NamedTuple):
@@ -104,16 +108,31 @@ def render(
         background: colour behind everything, 0 to 1.
         renderer: that draws; None: the fastest that loads.
 
-    Raises ShapeError when the renderer returns another shape or a value that is not finite.
+    Raises ShapeError when the renderer returns another shape or a value that is not finite, InputError when the picture
+    would take more memory than :func:`gsstream.core.memory.memory_limit` allows.
     """
     chosen = find_renderer() if renderer is None else renderer
     size = (cameras.width, cameras.height)
     pose = (cameras.viewmats[view], cameras.Ks[view])
     arrays = [array for _, array in gaussians.items()]
-    image = chosen.render_numpy(arrays, *pose, *size, background, near=cameras.near_plane)
+    what = f"drawing {len(gaussians)} Gaussians on {cameras.width} x {cameras.height} pixels"
+    require_memory(cameras.width * cameras.height * PER_PIXEL, what)
+    limit = {"max_memory": memory_limit()} if _takes_limit(chosen.render_numpy) else {}
+    try:
+        image = chosen.render_numpy(arrays, *pose, *size, background, near=cameras.near_plane, **limit)
+    except MemoryError as error:
+        raise InputError(
+            f"{what} takes too much memory: {error or 'the system has no more'}. Raise --max-memory, or the "
+            f"environment variable {VARIABLE}, if you trust this input"
+        ) from error
     check_shape(f"image of renderer {chosen.name!r}", image, (cameras.height, cameras.width, 3))
     check_finite(f"image of renderer {chosen.name!r}", image)
     return np.asarray(image, np.float32)
+
+
+@functools.cache
+def _takes_limit(function: Callable[..., FloatArray]) -> bool:
+    return "max_memory" in inspect.signature(function).parameters
 
 
 def to_bytes(image: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:

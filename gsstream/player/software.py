@@ -17,6 +17,8 @@ from gsstream.core.shapes import FloatArray, IntArray
 
 BLUR, ALPHA_CUT, ALPHA_MAX, TRANSMITTANCE_MIN = 0.3, 1 / 255, 0.999, 1e-4
 TILE = 16
+#: Bytes at the peak for every pair of a splat and a tile, and for every splat and pixel of the tile that is drawn.
+PAIR_BYTES, CELL_BYTES = 64, 64
 
 
 def render_numpy(
@@ -27,8 +29,13 @@ def render_numpy(
     height: int,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     near: float = 0.01,
+    max_memory: int | None = None,
 ) -> FloatArray:
-    """Render raw Gaussians (means, quats, scales, opacities, sh0, shN) for one camera: [height, width, 3] float32."""
+    """Render raw Gaussians (means, quats, scales, opacities, sh0, shN) for one camera: [height, width, 3] float32.
+
+    Raises MemoryError when pairs of Gaussians and tiles, and what one tile needs, would take more than ``max_memory``
+    bytes; both are counted before they are made.
+    """
     means, quats, scales, opacities, sh0, shN = arrays
     viewmat, K = np.asarray(viewmat, np.float64), np.asarray(K, np.float64)
     center = -viewmat[:3, :3].T @ viewmat[:3, 3]
@@ -44,7 +51,10 @@ def render_numpy(
     image = np.empty((height, width, 3), np.float32)
     image[:] = background
     table = np.column_stack([means2d, _conics(covariance), opacity, colors])
-    rows, tiles = _tile_lists(means2d, covariance, opacity, width=width, height=height)
+    low, span = _tile_boxes(means2d, covariance, opacity, width=width, height=height)
+    if max_memory is not None:
+        _check_memory(low, span, -(-width // TILE), -(-height // TILE), max_memory=max_memory)
+    rows, tiles = _tile_lists(low, span, -(-width // TILE))
     columns = -(-width // TILE)
     starts = np.flatnonzero(np.diff(tiles, prepend=-1))
     # With no pair at all `starts` is empty and the background stays.
@@ -97,10 +107,10 @@ def _colors(sh0: FloatArray, shN: FloatArray, directions: FloatArray) -> FloatAr
     return np.asarray(np.maximum(np.einsum("kn,nkc->nc", basis, coefficients) + 0.5, 0.0))
 
 
-def _tile_lists(
+def _tile_boxes(
     means2d: FloatArray, covariance: FloatArray, opacity: FloatArray, width: int, height: int
 ) -> tuple[IntArray, IntArray]:
-    """(splat, tile) pairs, tile by tile, splats in depth order. A splat reaches as far as its alpha exceeds the cut."""
+    """First tile and number of tiles [N, 2] (x, y) of every splat. It reaches as far as its alpha exceeds the cut."""
     reach2 = 2 * np.log(np.maximum(opacity / ALPHA_CUT, 1.0))
     # The tiny margin keeps pixels whose alpha equals the cut up to rounding.
     half = np.sqrt(reach2[:, None] * covariance[:, [0, 2]]) + 1e-6
@@ -108,11 +118,31 @@ def _tile_lists(
     with np.errstate(invalid="ignore"):
         low = np.clip(np.floor((means2d - half) / TILE), 0, limit).astype(np.int64)
         high = np.clip(np.floor((means2d + half) / TILE) + 1, 0, limit).astype(np.int64)
-    span = np.where((opacity >= ALPHA_CUT)[:, None], np.maximum(high - low, 0), 0)
+    return low, np.where((opacity >= ALPHA_CUT)[:, None], np.maximum(high - low, 0), 0)
+
+
+def _check_memory(low: IntArray, span: IntArray, columns: int, lines: int, max_memory: int) -> None:
+    """Raise MemoryError where the pairs, or the splats of the fullest tile, take too much."""
+    pairs = int((span[:, 0] * span[:, 1]).sum())
+    corners = np.zeros((lines + 1, columns + 1), np.int64)  # their sums from the first corner on count splats by tile
+    high = low + span
+    for sign, ys, xs in ((1, low, low), (-1, low, high), (-1, high, low), (1, high, high)):
+        np.add.at(corners, (ys[:, 1], xs[:, 0]), sign)
+    fullest = int(corners.cumsum(0).cumsum(1).max())
+    wanted = max(pairs * PAIR_BYTES, fullest * TILE * TILE * CELL_BYTES)
+    if wanted > max_memory:
+        raise MemoryError(
+            f"{pairs} pairs of Gaussians and tiles, {fullest} of them in one tile, about {wanted / 1e6:,.0f} MB where "
+            f"{max_memory / 1e6:,.0f} MB are allowed"
+        )
+
+
+def _tile_lists(low: IntArray, span: IntArray, columns: int) -> tuple[IntArray, IntArray]:
+    """(splat, tile) pairs, tile by tile, splats in depth order."""
     number = span[:, 0] * span[:, 1]
     rows = np.repeat(np.arange(len(number)), number)
     inside = np.arange(len(rows)) - np.repeat(np.cumsum(number) - number, number)
-    tile = (low[rows, 1] + inside // np.maximum(span[rows, 0], 1)) * limit[0]
+    tile = (low[rows, 1] + inside // np.maximum(span[rows, 0], 1)) * columns
     tile += low[rows, 0] + inside % np.maximum(span[rows, 0], 1)
     order = np.argsort(tile, kind="stable")
     return rows[order], tile[order]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,16 @@ import pytest
 from test_player import make_stream
 
 from gsstream.cli.main import run_command
+from gsstream.core.cameras import Cameras
 from gsstream.core.changes import Delta
 from gsstream.core.errors import InputError
-from gsstream.packet import StreamWriter, decode_packet, encode_delta, encode_key
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.memory import limited_memory
+from gsstream.packet import KeyState, StreamWriter, decode_packet, encode_delta, encode_key
 from gsstream.player.memory import MemoryLimit
 from gsstream.player.play import play
 from gsstream.player.playback import Playback
+from gsstream.player.render import PlayerRenderer, named_renderer, render
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "packet"))
 from packet_scenes import make_delta, make_edit, make_key, make_motions
@@ -26,8 +31,6 @@ MB = 1_000_000
 
 def many_equal(path: Path, number: int) -> Path:
     """A stream of few bytes for many Gaussians, as nobody's encoder writes it: one row, announced ``number`` times."""
-    from gsstream.packet import KeyState
-
     state = make_key(np.random.default_rng(0), 1, 1, 15)
     scene = state.gaussians.map(lambda a: np.repeat(a, number, axis=0))
     layout = type(state.layout)(np.int32([number]), np.zeros(number, np.uint8), state.layout.units)
@@ -111,3 +114,71 @@ def test_the_option_of_the_commands(command, tmp_path, capsys) -> None:
     assert run_command([*arguments, "--max-memory", "5 parsecs"]) == 2
     assert "--max-memory 5 parsecs" in capsys.readouterr().err
     assert run_command([*arguments, "--max-memory", "50MB"]) == 0
+
+
+def covering(number: int) -> Gaussians:
+    """Gaussians in one place, each of which covers any picture: a few bytes of a packet."""
+    state = make_key(np.random.default_rng(0), 1, 1, 0)
+    one = replace(
+        state.gaussians,
+        means=np.float32([[0, 0, 3]]),
+        scales=np.full((1, 3), 1, np.float32),
+        opacities=np.float32([-2]),
+    )
+    return one.map(lambda a: np.repeat(a, number, axis=0))
+
+
+@pytest.fixture
+def wide() -> Cameras:
+    K = np.array([[300.0, 0, 320], [0, 300, 320], [0, 0, 1]])
+    return Cameras(("a",), np.eye(4)[None], K[None], 640, 640)
+
+
+@pytest.mark.parametrize("name", ["numpy", "cpu"])
+def test_gaussians_that_cover_the_picture_are_refused_before_their_pairs_take_memory(name, wide) -> None:
+    """65,536 of them on 640 x 640 pixels are a hundred million pairs of Gaussians and tiles."""
+    if name == "cpu":
+        pytest.importorskip("gsstream_cpu_render")
+    renderer = named_renderer(name)
+    many = covering(20_000)
+    tracemalloc.start()
+    try:
+        with limited_memory(30 * MB), pytest.raises(InputError, match=r"drawing 20000 Gaussians on 640 x 640 .*Raise"):
+            render(many, wide, renderer=renderer)
+        assert tracemalloc.get_traced_memory()[1] < 60 * MB
+    finally:
+        tracemalloc.stop()
+    few = covering(20)
+    with limited_memory(30 * MB):
+        within = render(few, wide, renderer=renderer)
+    assert np.array_equal(within, render(few, wide, renderer=renderer))
+    with limited_memory(10 * MB), pytest.raises(InputError, match=r"drawing 20 Gaussians on 640 x 640"):
+        render(few, wide, renderer=renderer)
+
+
+def test_a_renderer_that_fails_for_memory_is_one_sentence(wide) -> None:
+    def greedy(*_: object, near: float) -> np.ndarray:
+        raise MemoryError("std::bad_alloc")
+
+    with pytest.raises(InputError, match=r"takes too much memory: std::bad_alloc. Raise --max-memory"):
+        render(covering(1), wide, renderer=PlayerRenderer("greedy", greedy))
+
+
+@pytest.mark.parametrize(
+    "arguments", [["play"], ["play", "--renderer", "numpy"], ["export", "--format", "page"]], ids=" ".join
+)
+def test_a_small_stream_of_such_gaussians_is_refused_by_every_command(arguments, tmp_path, capsys) -> None:
+    state = make_key(np.random.default_rng(0), 1, 1, 0)
+    scene, number = covering(20_000), 20_000
+    layout = type(state.layout)(np.int32([number]), np.zeros(number, np.uint8), state.layout.units)
+    K = np.array([[300.0, 0, 320], [0, 300, 320], [0, 0, 1]])
+    rig = Cameras(("a",), np.eye(4)[None], K[None], 640, 640)
+    with StreamWriter.open(tmp_path / "s.gss") as writer:
+        writer.append(encode_key(KeyState(scene, layout, replace(state.meta, train=rig, test=rig))))
+    assert (tmp_path / "s.gss").stat().st_size < 5000
+    command, *options = arguments
+    given = [command, str(tmp_path / "s.gss"), "--out", str(tmp_path / "o"), *options, "--max-memory", "60MB"]
+    assert run_command(given) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: drawing 20000 Gaussians on 640 x 640 pixels takes too much memory: ")
+    assert said.count("\n") == 1

@@ -107,9 +107,12 @@ def raise_on_faults(faults: int, splats: SplatArrays) -> None:
     Raises:
         ShapeError: a NaN or infinity (array and index), a quaternion without direction (row), or finite values so
             large that they overflow float32.
+        MemoryError: more pairs of Gaussians and tiles than the rasteriser may make.
     """
     if not faults:
         return
+    if faults & _native.FAULT_PAIRS:
+        raise MemoryError("the Gaussians cover more tiles of the picture than the limit on memory allows")
     for name, value in splats._asdict().items():
         if found := first_non_finite(name, value):
             refuse(found)

@@ -22,6 +22,9 @@ from gsstream_cpu_render.checks import Float32, refuse, refuse_value
 from gsstream_cpu_render.loss import PreparedImage, weighted
 from gsstream_cpu_render.view import NEAR, Background, checked_view
 
+#: Bytes at the peak of a forward pass for every Gaussian, and for every pair of a Gaussian and a tile, measured.
+SPLAT_BYTES, PAIR_BYTES = 120, 48
+
 
 def native_scene(splats: SplatArrays) -> Any:
     """The checked arrays as the one handle that the kernels take; nothing is copied."""
@@ -58,6 +61,10 @@ class NativeRasterizer:
     def free_scratch(self) -> None:
         """Free the memory that only full passes need; the cache stays. No backward may follow; call freeze again."""
         self._native.free_scratch()
+
+    def limit_memory(self, most: int, rows: int) -> None:
+        """Let forward passes of ``rows`` Gaussians take at most ``most`` bytes; they raise MemoryError before more."""
+        self._native.limit_pairs(max(0, most - SPLAT_BYTES * rows) // PAIR_BYTES)
 
     def release(self) -> Any:
         """Give away the native object with its memory. This object is of no use afterwards."""
@@ -196,6 +203,9 @@ class NativeRasterizer:
             return getattr(self._native, name)(*arguments) or 0
         except ValueError as error:
             refuse_value(str(error))
+        except MemoryError as error:  # its message is the name of a class in C++
+            size = f"{self.width} x {self.height} pixels"
+            raise MemoryError(f"{name}: the system has no memory for a view of {size} and its Gaussians") from error
 
     def _target(self, image: Float32 | None, transmittance: Float32 | None) -> tuple[Float32, Float32]:
         h, w = self.height, self.width

@@ -34,6 +34,7 @@ def render_numpy(
     height: int,
     background: Background = (0.0, 0.0, 0.0),
     near: float = NEAR,
+    max_memory: int | None = None,
 ) -> Float32:
     """Render raw Gaussians for one camera: [height, width, 3].
 
@@ -42,11 +43,13 @@ def render_numpy(
 
     Raises:
         InputError: wrong shapes, values that are not finite, a quaternion without direction.
+        MemoryError: it would take more than ``max_memory`` bytes, which is known before they are taken.
     """
     splats = SplatArrays(*(np.ascontiguousarray(part, np.float32) for part in arrays))
-    return NumpyRasterizer(viewmat=viewmat, K=K, width=width, height=height, background=background, near=near).forward(
-        splats
-    )[0]
+    view = NumpyRasterizer(viewmat=viewmat, K=K, width=width, height=height, background=background, near=near)
+    if max_memory is not None:
+        view.limit_memory(max_memory, len(splats.means))
+    return view.forward(splats)[0]
 
 
 class NumpyRasterizer(NativeRasterizer):

@@ -16,6 +16,7 @@ struct BlockCorners {
   }
 };
 constexpr BlockCorners CORNERS;
+constexpr std::size_t PAIRS_UNCOUNTED = 1 << 14;  // of one chunk, before all threads hear of them
 
 // Blocks of a tile where alpha reaches 1/255 somewhere on the rectangle spanned by the block's pixel centres. Exact:
 // log2(alpha) is a concave quadratic, so its maximum over the rectangle lies at the centre of the Gaussian (if
@@ -159,11 +160,21 @@ GSS_INLINE uint32_t faults_of(const Splats& s, uint32_t lanes) {
   return faults;
 }
 
+// Whether the pairs of all chunks are still within the limit; adds those of this chunk that are not counted yet.
+GSS_INLINE bool within_limit(const ProjectJob& job, std::size_t fresh) {
+  return __atomic_add_fetch(job.pair_count, fresh, __ATOMIC_RELAXED) <= job.most_pairs;
+}
+
 template <int K>
 void project_chunk(const ProjectJob& job, std::size_t first, std::size_t end, ProjectChunk& chunk) {
   chunk.visible = 0;
   chunk.faults = 0;
   chunk.pairs.size = 0;
+  std::size_t counted = 0;
+  if (!within_limit(job, 0)) {
+    chunk.faults |= FAULT_PAIRS;
+    return;
+  }
   for (std::size_t i = first; i < end; i += LANES) {
     const int valid = static_cast<int>(end - i < LANES ? end - i : LANES);
     const uint32_t lanes = (1u << valid) - 1;
@@ -178,6 +189,13 @@ void project_chunk(const ProjectJob& job, std::size_t first, std::size_t end, Pr
     const uint32_t candidates = lanes & footprints(job, s, f);
     const uint32_t visible = emit_group(job, f, rows, candidates, chunk);
     if (visible) color_group<K>(job, rows, visible, s, chunk);
+    const std::size_t fresh = chunk.pairs.size - counted;
+    if (fresh < PAIRS_UNCOUNTED && i + LANES < end) continue;
+    counted = chunk.pairs.size;
+    if (!within_limit(job, fresh)) {
+      chunk.faults |= FAULT_PAIRS;
+      return;
+    }
   }
 }
 

@@ -67,7 +67,8 @@ struct PairList {
   void reserve_more(std::size_t extra);
 };
 
-enum Fault : uint32_t { FAULT_NOT_FINITE = 1, FAULT_QUATERNION = 2 };
+// FAULT_PAIRS: more pairs than the caller allows; the projection stops where they are too many.
+enum Fault : uint32_t { FAULT_NOT_FINITE = 1, FAULT_QUATERNION = 2, FAULT_PAIRS = 4 };
 
 // Result of projecting PROJECT_CHUNK consecutive rows.
 constexpr std::size_t PROJECT_CHUNK = 256;
@@ -87,6 +88,8 @@ struct ProjectJob {
   const int32_t* active_sum;    // [(tiles_y+1)*(tiles_x+1)] summed-area table of tile_blocks != 0
   Record* records;              // [count], written where visible
   ProjectChunk* chunks;
+  std::size_t most_pairs;   // of all chunks
+  std::size_t* pair_count;  // of all chunks so far; all threads add to it
 };
 
 constexpr uint32_t FROZEN = ~0u;

@@ -120,9 +120,11 @@ uint32_t Rasterizer::project(const Scene& scene, const TileSelection& selection,
     work.chunks = std::make_unique<ProjectChunk[]>(chunks);
     work.chunk_capacity = chunks;
   }
+  std::size_t pair_count = 0;
   ProjectJob job{scene.arrays,         scene.count,       camera_,
                  selection.tiles_x,    selection.tiles_y, selection.blocks.data(),
-                 selection.sum.data(), records,           work.chunks.get()};
+                 selection.sum.data(), records,           work.chunks.get(),
+                 most_pairs_,          &pair_count};
   parallel_for(chunks, 1,
                [&](std::size_t begin, std::size_t end) { project_kernels_.forward[scene.sh_degree](job, begin, end); });
   uint32_t faults = 0;

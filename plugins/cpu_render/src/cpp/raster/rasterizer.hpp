@@ -144,6 +144,8 @@ class Rasterizer {
   // The same without clearing `out`, to which other rasterisers may add at the same time.
   void add_drawn(const uint8_t* mask, uint8_t* out);
 
+  // Forward passes of more (Gaussian, tile) pairs than this stop before they are made, with FAULT_PAIRS.
+  void limit_pairs(std::size_t most) { most_pairs_ = most; }
   // Ends the life of the arrays given to the last forward; no backward may follow.
   void forget() { drop_pass(); }
   // out.means null: only out.means2d is written. Outputs have one row per Gaussian (zero where unseen), or with
@@ -212,6 +214,7 @@ class Rasterizer {
   const ProjectBackwardKernels& project_backward_kernels_;
   const CompositeKernels& composite_kernels_;
   std::atomic<std::thread::id> owner_{};  // the thread that runs a call
+  std::size_t most_pairs_ = ~std::size_t{0};
   uint64_t passes_ = 0;
   State state_ = State::empty;
 

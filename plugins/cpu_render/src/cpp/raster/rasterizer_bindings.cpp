@@ -82,6 +82,8 @@ class PyRasterizer {
     rasterizer_.contributing_in_cache(mask, out.data());
   }
 
+  void limit_pairs(std::size_t most) { rasterizer_.limit_pairs(most); }
+
   void free_scratch() {
     rasterizer_.free_scratch();
     hold({});
@@ -211,6 +213,7 @@ static auto strict(const char* name) { return nb::arg(name).noconvert(); }
 void bind_rasterizer(nb::module_& module) {
   module.attr("FAULT_NOT_FINITE") = static_cast<uint32_t>(FAULT_NOT_FINITE);
   module.attr("FAULT_QUATERNION") = static_cast<uint32_t>(FAULT_QUATERNION);
+  module.attr("FAULT_PAIRS") = static_cast<uint32_t>(FAULT_PAIRS);
   nb::class_<SceneArrays>(module, "Scene", "Raw parameters of N Gaussians, float32 and contiguous; not copied.")
       .def(nb::init<ConstFloatArray, ConstFloatArray, ConstFloatArray, ConstFloatArray, ConstFloatArray,
                     ConstFloatArray>(),
@@ -245,6 +248,7 @@ void bind_rasterizer(nb::module_& module) {
       .def("visible_in_cache", &PyRasterizer::visible_in_cache, strict("out"))
       .def("contributing_in_cache", &PyRasterizer::contributing_in_cache, strict("tile_mask").none(), strict("out"))
       .def("free_scratch", &PyRasterizer::free_scratch)
+      .def("limit_pairs", &PyRasterizer::limit_pairs, nb::arg("most"), "Forward passes of more pairs give FAULT_PAIRS.")
       .def("forward_cached", &PyRasterizer::forward_cached, strict("background"), strict("tile_mask").none(),
            GSS_TARGET)
       .def("visible_rows", &PyRasterizer::visible_rows, strict("out"))

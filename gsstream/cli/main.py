@@ -14,6 +14,7 @@ from typer.main import get_command
 
 from gsstream import API_VERSION, __version__
 from gsstream.cli.listing import printable
+from gsstream.cli.system_errors import describe, drop_output, flush_output
 from gsstream.cli.table import CommandTable
 from gsstream.core.errors import GsstreamError, InputError
 from gsstream.core.install_hints import missing_for_encoding
@@ -75,6 +76,7 @@ def run_command(argv: Sequence[str]) -> int:
         warnings.showwarning = _show_warning
         try:
             code = get_command(app).main(list(argv), prog_name="gsstream", standalone_mode=False, obj=options)
+            flush_output()
         except typer.TyperException as error:
             error.show()  # type: ignore[attr-defined]  # every error of the parser has it; typer's base class hides it
             return error.exit_code
@@ -93,6 +95,12 @@ def run_command(argv: Sequence[str]) -> int:
                 raise
             typer.echo(f"error: {printable(cure)}", err=True)
             return 1
+        except (OSError, MemoryError, RuntimeError) as error:
+            if options.debug or (told := describe(error)) is None:
+                raise
+            drop_output()
+            typer.echo(f"error: {printable(told[1])}", err=True)
+            return told[0]
     if code == 130:
         return _interrupted()
     if code in _SIGNALS:

@@ -25,6 +25,7 @@ from gsstream import API_VERSION, __version__
 from gsstream.core.errors import PluginUnavailable, suggest
 from gsstream.core.versions import version_problem
 from gsstream.discovery import builtin, hookspecs
+from gsstream.discovery.outputs import kept_outputs
 from gsstream.spec import ENTRY_POINT_GROUP, CommandSpec, ComponentSpec, MethodSpec
 
 Spec = ComponentSpec | MethodSpec | CommandSpec
@@ -109,8 +110,11 @@ def _inspect(name: str, distribution: str, version: str, load: Any) -> Discovere
     late.daemon = True
     late.start()
     try:
-        module = load()
-        _collect(module, declared)
+        with kept_outputs() as closed:
+            module = load()
+            _collect(module, declared)
+        if closed:
+            raise PluginFault(f"it closed {' and '.join(closed)} while it was loaded; what it closed is open again")
     except KeyboardInterrupt:
         raise  # Ctrl-C: a plugin that raises KeyboardInterrupt cannot be told from a user who presses it
     except BaseException as error:  # containing whatever a plugin raises is the purpose of this function

@@ -24,6 +24,8 @@ REASONS = {
     "'propagation', 'gate', 'motion', 'update', 'growth', 'regularizer', 'streaming_method', 'renderer', 'loss', "
     "'optimiser' or 'source', got 'gatte'",
     "command_clash": "declares the command 'run', which gsstream 0.1.0 already provides; rename it",
+    "closes_stdout": "it closed stdout while it was loaded; what it closed is open again",
+    "closes_numbers": "it closed stdout and stderr while it was loaded; what it closed is open again",
     "no_hook": "gsstream_no_hook_plugin implements no hook; expected @hookimpl on one of gsstream_components, ",
 }
 

@@ -23,6 +23,9 @@ import difflib
 from collections.abc import Iterable
 from typing import Any
 
+#: Letters of a name that nobody knows, in a message.
+LONGEST_SHOWN = 120
+
 
 class GsstreamError(Exception):
     """Base of every error raised on purpose. Survives pickling with its attributes, so workers can report it."""
@@ -67,7 +70,8 @@ class UnknownName(InputError):
 
     def __init__(self, kind: str, name: str, known: Iterable[str], hint: str = "") -> None:
         self.kind, self.name, self.known = kind, name, tuple(sorted(known))
-        super().__init__(f"no {kind} named {name!r}{suggest(name, self.known)}{hint}")
+        shown = name if len(name) <= LONGEST_SHOWN else f"{name[:LONGEST_SHOWN]} ..."
+        super().__init__(f"no {kind} named {shown!r}{suggest(shown, self.known)}{hint}")
 
 
 class PacketError(GsstreamError, ValueError):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -25,10 +26,11 @@ from gsstream.recipe.shipped import hint
 KeyPath = tuple[str, ...]
 #: Bytes of a recipe file; a whole recipe with all its settings has about 5 KB.
 LONGEST = 200_000
-#: Lists within lists.
-DEEPEST = 100
+#: Lists within lists; and values, as the signs between them say: a reader of YAML takes a second for ten thousand.
+DEEPEST, MOST_VALUES = 100, 5_000
 #: Keys that hold lists of names. What stands in them is text, so that a camera may be called 0012.
 NAMES = (("data", "test_cameras"), ("data", "train_cameras"))
+_BETWEEN = re.compile(r"[,\r\n]|[-?:][ \t]")
 _NESTING = {"[": 1, "{": 1, "]": -1, "}": -1}
 
 
@@ -139,6 +141,9 @@ def _compose(text: str, name: str) -> Node | None:
     deepest = max(itertools.accumulate(_NESTING.get(sign, 0) for sign in text), default=0)
     if deepest > DEEPEST:  # the parser would find out, too, after a minute
         raise RecipeError(f"{name}: not valid YAML: nested too deeply")
+    values = len(_BETWEEN.findall(text))
+    if values > MOST_VALUES:
+        raise RecipeError(f"{name}: expected at most {MOST_VALUES} values, as a recipe has; got about {values}")
     try:
         return YAML(typ="safe", pure=True).compose(text)  # type: ignore[no-any-return]
     except MarkedYAMLError as error:

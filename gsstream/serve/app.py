@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from starlette.responses import Response
     from starlette.websockets import WebSocket
 
+#: Bytes of the longest address that is answered.
+MAX_ADDRESS = 4096
 STREAM, MANIFEST, SOCKET = "/stream.gss", "/stream.json", "/live"
 
 
@@ -38,7 +40,13 @@ class Rules:
 
     def refusal(self, request: HTTPConnection, *, guarded: bool) -> tuple[int, str] | None:
         """Return status and sentence with which a request is refused, or None."""
-        name = urlsplit(f"//{request.headers.get('host', '')}").hostname
+        try:
+            name = urlsplit(f"//{request.headers.get('host', '')}").hostname
+            urlsplit(request.headers.get("origin", ""))
+        except ValueError:
+            return 400, "The Host or the Origin of this request is no name of a server."
+        if len(request.scope.get("raw_path", b"")) + len(request.scope["query_string"]) > MAX_ADDRESS:
+            return 414, "The address is too long."
         if self.hosts is not None and name not in self.hosts:
             return 403, "This server does not answer to that name."
         if guarded and self.token is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import stat
 from pathlib import Path
 from typing import NamedTuple
 
@@ -66,6 +67,8 @@ class Follower:
         """Read the packets that were written since the last call. Returns whether anything changed."""
         try:
             seen = self.path.stat()
+            if not stat.S_ISREG(seen.st_mode):
+                raise FileNotFoundError  # a pipe would stop the server for as long as nobody writes into it
         except OSError:
             changed, self._seen = self._seen is not None, None
             return changed

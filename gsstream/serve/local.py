@@ -43,13 +43,18 @@ class _Handler(SimpleHTTPRequestHandler):
         """Refuse other names: a page elsewhere may give itself the address of this machine."""
         if not super().parse_request():
             return False
-        if urlsplit(f"//{self.headers.get('Host', '')}").hostname in (HOST, "localhost"):
+        try:
+            name = urlsplit(f"//{self.headers.get('Host', '')}").hostname
+        except ValueError:
+            self.send_error(400, "The Host of this request is no name of a server")
+            return False
+        if name in (HOST, "localhost"):
             return True
         self.send_error(403, "This server does not answer to that name")
         return False
 
     def translate_path(self, path: str) -> str:
-        if urlsplit(path).path == "/stream.gss":
+        if path.partition("?")[0].partition("#")[0] == "/stream.gss":
             return str(self.stream)
         return super().translate_path(path.replace("%00", "_"))
 

@@ -112,13 +112,17 @@ class Server:
     async def _serve(self, ready: threading.Event | None = None) -> None:
         import uvicorn
 
+        from gsstream.serve.patience import Patience, guarded
+
+        patience = Patience()
         config = uvicorn.Config(
             self.app,
             log_config=None,
             access_log=False,
-            log_level="warning",
+            log_level="error",  # whoever sends nonsense gets an answer, and the terminal no line
             lifespan="on",
             server_header=False,
+            http=guarded(patience),
             ws="websockets-sansio",
             ws_max_size=_MAX_MESSAGE_BYTES,
             ws_per_message_deflate=False,
@@ -129,6 +133,7 @@ class Server:
         )
         server = uvicorn.Server(config)
         self._loop = asyncio.get_running_loop()
+        waiting = asyncio.create_task(patience.run())
         task = asyncio.create_task(server.serve(sockets=[self._socket]))
         if ready is not None:
             while not server.started and not task.done():
@@ -136,7 +141,10 @@ class Server:
             ready.set()
             await self._loop.run_in_executor(None, self._stop.wait)
             server.should_exit = True
-        await task
+        try:
+            await task
+        finally:
+            waiting.cancel()
 
 
 def _listen(host: str, port: int) -> socket.socket:

@@ -31,6 +31,12 @@ FILES = {
     "a base of 5000 letters": b"base: " + b"x" * 5000, "a path of 6000 letters": b"base: " + b"x/" * 3000 + b"a.yaml",
     "a base with a NUL": b'base: "a\\0b.yaml"', "a folder as its base": b"base: ./", "no UTF-8": b"\xff\xfe\x00",
     "a list of 6 MB": b"data: [" + b"1," * 3_000_000 + b"]", "a key that is a number": b"!!int abc: 1",
+    "a list of 190 KB": b"data: {test_cameras: [" + b"1," * 95_000 + b"]}",
+    "a list of 190 KB, line by line": b"frames:\n" + b"- 1\n" * 47_000, "a line of dashes": b"a: \n " + b"- " * 90_000,
+    "a line of colons": b"a" + b": a" * 60_000, "a line of question marks": b"? " * 90_000,
+    "a line of tags": b"a: " + b"!a " * 60_000, "a line of anchors": b"a: " + b"&a " * 60_000,
+    "a word of 190 KB": b"method: " + b"x" * 190_000, "a text of 190 KB": b'method: "' + b"\\x41" * 47_000 + b'"',
+    "a folded text": b"method: >\n" + b"  a b\n" * 30_000, "lines without end": b"\n" * 190_000,
     "twenty thousand keys": "\n".join(f"key{i}: 1" for i in range(20_000)).encode(),
 }  # fmt: skip
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
@@ -262,6 +263,52 @@ def test_documents_escape_what_they_show():
     assert "&lt;td&gt;" in page
     assert '<img src="data:image/png;base64,eA==" alt="say &quot;hi&quot;" />' in page
     assert to_markdown("t", blocks).startswith("# t\n\n## <x>\n\na & b <b>c</b> [d](http://e)\n\n**c|d**")
+
+
+class Requested(HTMLParser):
+    """Notes every address that a browser would ask for, and every element that could run something."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+        self.elements: set[str] = set()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.add(tag)
+        for name, value in attrs:
+            assert not name.startswith("on"), f"{tag} {name}"
+            if name in ("src", "srcset", "href", "data", "poster", "action", "background", "style", "content"):
+                self.addresses.append(value or "")
+
+
+HOSTILE = [
+    "![x](http://evil.example/a.png)",
+    "![x][1]\n\n[1]: http://evil.example/b.png",
+    "[1]: http://evil.example/c.png",
+    "![x](p.png)",
+    "<img src=http://evil.example/d.png>",
+    "<http://evil.example>",
+    "[x](javascript:alert(1))",
+    '"><script src="//evil.example/e.js"></script>',
+    "<style>@import url(http://evil.example)</style>",
+    "<svg><image href=http://evil.example/>",
+    "<link rel=stylesheet href=http://evil.example>",
+    "<iframe src=http://evil.example>",
+    "http://evil.example/f.png",
+    "`![x](http://evil.example/g.png)`",
+    "> ![x](http://evil.example/h.png)",
+    "1. ![x](http://evil.example/i.png)",
+]
+
+
+def test_no_text_makes_a_report_fetch_anything():
+    """A description, a reason of a failure, a caption and what a picture shows are other people's text."""
+    for text in HOSTILE:
+        table = Table(text.replace("\n", " "), [["h", text], [text, "x"]])
+        page = Requested()
+        page.feed(to_html(text, [text, f"## {text}", table, Picture("p.png", b"x", text)]))
+        assert [a for a in page.addresses if a != "width=device-width"] == ["data:image/png;base64,eA=="], text
+        assert not page.elements & {"script", "a", "link", "iframe", "object", "base", "form", "svg", "image"}, text
 
 
 def test_a_folder_without_results_says_so(tmp_path):

@@ -59,24 +59,29 @@ def write_report(title: str, blocks: Sequence[Block], out: Path) -> list[Path]:
 
 def to_markdown(title: str, blocks: Sequence[Block]) -> str:
     """Return Markdown; pictures by their names."""
-    parts = [f"# {title}"]
-    for block in blocks:
-        if isinstance(block, Table):
-            rows = [[cell.replace("|", "\\|") for cell in row] for row in block.rows]
-            parts.append(f"**{block.caption}**\n\n{format_table(rows)}")
-        else:
-            parts.append(f"![{block.text}]({block.name})" if isinstance(block, Picture) else block)
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join([f"# {title}", *map(_text, blocks)]) + "\n"
+
+
+def _text(block: Block) -> str:
+    """A block as Markdown."""
+    if isinstance(block, Table):
+        rows = [[cell.replace("|", "\\|") for cell in row] for row in block.rows]
+        return f"**{block.caption}**\n\n{format_table(rows)}"
+    return f"![{block.text}]({block.name})" if isinstance(block, Picture) else block
+
+
+def _img(picture: Picture) -> str:
+    """A picture as HTML, with its bytes."""
+    data = f"data:{_TYPES[Path(picture.name).suffix]};base64,{base64.b64encode(picture.data).decode()}"
+    return f'<p><img src="{data}" alt="{html.escape(picture.text)}" /></p>\n'
 
 
 def to_html(title: str, blocks: Sequence[Block]) -> str:
     """Return one page: styles and images inside, no script, nothing fetched."""
-    markdown = MarkdownIt("commonmark", {"html": False}).enable("table").disable(["link", "autolink"])
-    body = markdown.render(to_markdown(title, blocks))
-    for block in blocks:
-        if isinstance(block, Picture):
-            data = f"data:{_TYPES[Path(block.name).suffix]};base64,{base64.b64encode(block.data).decode()}"
-            body = body.replace(f'src="{block.name}"', f'src="{data}"')
+    # Descriptions and reasons are other people's text: what would be a link or a picture in Markdown stays text.
+    markdown = MarkdownIt("commonmark", {"html": False}).enable("table").disable(["link", "autolink", "image"])
+    parts = [_img(block) if isinstance(block, Picture) else markdown.render(_text(block)) for block in blocks]
+    body = f"<h1>{html.escape(title)}</h1>\n{''.join(parts)}"
     head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{_STYLE}</style>'
     head += '<meta name="viewport" content="width=device-width">'
     return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}</body></html>\n'

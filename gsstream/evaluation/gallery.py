@@ -54,6 +54,11 @@ def _still_pictures(out: Path, source: Source, meta: StreamMeta, records: Sequen
 def _write_summary(out: Path, meta: StreamMeta, records: Sequence[FrameRecord]) -> Path:
     text = [summary_table({meta.title: summarise(records)}), "", held_out_line(meta)]
     lines = read_lines(out / METRICS)
+    if lines[0].get("blank_views") == len(meta.train):
+        text += [
+            "",
+            "frame 0 shows nothing in any training camera, and everything is built on it: begin at a later frame",
+        ]
     for part in (latency_lines(lines), budget_lines(lines)):
         text += ["", *part] if part else []
     (out / SUMMARY).write_text("\n".join(text) + "\n", encoding="utf-8")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gsstream.core.log import FrameLog
+from gsstream.engine.run.blank import start_numbers
 from gsstream.engine.run.displacement import displacement_pixels
 from gsstream.engine.run.encoder import Encoder
 from gsstream.engine.run.measure import HeldOut
@@ -37,6 +38,8 @@ def measure_again(
             log_packet(log, player, EncodedPacket(data, _sizes(data)))
             line = {"frame": entry.frame, "status": entry.kind.name.lower(), **log.numbers, "live": None}
             line["displacement_pixels"] = displacement_pixels(player, source.info.train)
+            if entry.frame == 0:
+                line |= start_numbers(source.frame(0, "train"))
             if held_out is not None and len(source.info.test):
                 line |= held_out.measure(player, encoder.with_near_plane(source.frame(entry.frame, "test")))
             yield line

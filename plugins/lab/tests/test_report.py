@@ -277,7 +277,9 @@ class Requested(HTMLParser):
         self.elements.add(tag)
         for name, value in attrs:
             assert not name.startswith("on"), f"{tag} {name}"
-            if name in ("src", "srcset", "href", "data", "poster", "action", "background", "style", "content"):
+            if name == "style":
+                assert value in ("text-align:left", "text-align:right"), value
+            if name in ("src", "srcset", "href", "data", "poster", "action", "background", "content"):
                 self.addresses.append(value or "")
 
 

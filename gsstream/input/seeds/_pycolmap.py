@@ -7,11 +7,18 @@ system's one, the two mix and the next compression corrupts the heap. Loaded fir
 from __future__ import annotations
 
 import itertools
+import os
 import zlib  # noqa: F401  must precede pycolmap, see above
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+# Read when the libraries of pycolmap are loaded. How many threads their linear algebra takes depends on what other
+# threads do at that moment, and the last bits of its sums on that number. Pictures and pairs are still worked on at the
+# same time, by threads of COLMAP's own.
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
 import pycolmap
 
 from gsstream.input.seeds._features import (
@@ -110,7 +117,7 @@ def _points_of(reconstruction: Any) -> dict[str, Any]:
 def _known_rig(db: Any, viewmats: Any, Ks: Any, width: int, height: int) -> Any:
     """A reconstruction without points whose cameras and poses are the given ones, with the database's numbering."""
     reconstruction = pycolmap.Reconstruction()
-    for image in db.read_all_images():
+    for image in sorted(db.read_all_images(), key=lambda image: image.name):
         index = int(Path(image.name).stem)
         K = Ks[index]
         camera = db.read_camera(image.camera_id)

@@ -43,11 +43,15 @@ def build(folder: Path) -> Path:
 
 
 def environment(module: Path) -> dict[str, str]:
-    """Return what a process needs that loads the module: the sanitiser's own library must come first."""
-    library = subprocess.run(["gcc", "-print-file-name=libasan.so"], check=True, capture_output=True, text=True)
+    """Return what a process needs that loads the module.
+
+    The sanitiser's own library must come first, and that of C++ beside it, whose exceptions it watches.
+    """
+    ask = (["gcc", f"-print-file-name={name}"] for name in ("libasan.so", "libstdc++.so.6"))
+    found = [subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip() for command in ask]
     return {
         **os.environ,
-        "LD_PRELOAD": str(Path(library.stdout.strip()).resolve()),
+        "LD_PRELOAD": " ".join(str(Path(library).resolve()) for library in found),
         "GSSTREAM_SANITISED": str(module),
         "PYTHONPATH": os.pathsep.join([str(module.parent), str(ROOT)]),
         # Python keeps what it has until the end of the process; and a call that wants too much memory is refused.

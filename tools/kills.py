@@ -111,7 +111,7 @@ def noted(folder: Path) -> Iterator[Journal]:
         if "b" in mode and buffering == 0:
             return raw
         buffer: Any = io.BufferedRandom(raw) if "+" in mode else io.BufferedWriter(raw)
-        return buffer if "b" in mode else io.TextIOWrapper(buffer, *args, line_buffering=buffering == 1, **kwargs)
+        return buffer if "b" in mode else io.TextIOWrapper(buffer, *args, **kwargs)
 
     def os_opened(path: Any, flags: int, *args: Any, **kwargs: Any) -> int:
         name = journal.name_of(path) if flags & os.O_CREAT else None

@@ -171,7 +171,7 @@ def picture_size(text: str | None) -> tuple[int, int] | None:
 
 def size_of(text: str | None) -> int | None:
     """Return the bytes meant by ``--max-memory``; None: no limit."""
-    from gsstream.recipe.budget import BYTES, read_quantity
+    from gsstream.core.quantity import BYTES, read_quantity
 
     if text is None:
         return None

@@ -6,9 +6,9 @@ import threading
 
 import numpy as np
 import pytest
-from cpu_scenes import HEIGHT, WIDTH, camera, random_splats, rasterizer, upstream
+from cpu_scenes import BACKGROUND, HEIGHT, WIDTH, camera, equal_bits, random_splats, rasterizer, upstream
 from gsstream_cpu_render.arrays import SplatArrays, new_gradients
-from gsstream_cpu_render.rasterizer import NumpyRasterizer
+from gsstream_cpu_render.rasterizer import NumpyRasterizer, render_numpy
 
 from gsstream.api import InputError, ShapeError
 
@@ -164,3 +164,31 @@ def test_splat_arrays_have_gsstreams_names_in_gsstreams_order() -> None:
     from gsstream.api import ATTRIBUTES
 
     assert SplatArrays._fields == tuple(ATTRIBUTES)
+
+
+def test_more_pairs_than_the_memory_allows_are_refused_and_the_next_pass_is_as_ever() -> None:
+    """Every Gaussian covers every tile; the limit counts pairs of all threads together."""
+    splats = random_splats(3000, 1, 1)
+    wide = splats._replace(scales=np.full_like(splats.scales, 3.0))
+    subject = rasterizer()
+    alone = rasterizer().forward(splats)
+    for most in (0, 1, 100_000):
+        subject.limit_memory(most, 3000)
+        with pytest.raises(MemoryError, match="cover more tiles of the picture than the limit on memory allows"):
+            subject.forward(wide)
+    subject.limit_memory(100_000_000, 3000)
+    assert equal_bits(subject.forward(wide), rasterizer().forward(wide))
+    assert equal_bits(subject.forward(splats), alone)
+    subject.limit_memory(500_000, 3000)
+    with pytest.raises(MemoryError):
+        subject.forward(wide)
+    with pytest.raises(InputError, match="expected a forward pass"):
+        subject.backward(np.zeros((HEIGHT, WIDTH, 3), np.float32))
+
+
+def test_a_limit_that_is_never_met_changes_no_bit() -> None:
+    splats = random_splats(500, 2, 4)
+    viewmat, K = camera()
+    free = render_numpy(splats, viewmat, K, WIDTH, HEIGHT, BACKGROUND)
+    bound = render_numpy(splats, viewmat, K, WIDTH, HEIGHT, BACKGROUND, max_memory=1 << 30)
+    assert free.tobytes() == bound.tobytes()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import json
 import os
@@ -175,6 +176,24 @@ def test_points_lie_on_the_true_surfaces_and_repeat() -> None:
     assert (error < 0.03).mean() > 0.9
     assert 0 < points.rgb.mean() < 1
     assert sfm.triangulate_points(images, cameras).xyz.tobytes() == points.xyz.tobytes()
+
+
+@needs_pycolmap
+def test_linear_algebra_takes_one_thread_whatever_the_environment_says() -> None:
+    """How many threads a library takes while others work is a question of timing, and last bits follow it."""
+    code = (
+        "import os, ctypes\n"
+        "import gsstream.input.seeds._pycolmap\n"
+        "libraries = {line.split()[-1] for line in open('/proc/self/maps') if 'gomp' in line}\n"
+        "print([os.environ['OMP_NUM_THREADS'], *(ctypes.CDLL(path).omp_get_max_threads() for path in libraries)])\n"
+    )
+    environment = {**os.environ, "OMP_NUM_THREADS": "7"}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    name, *found = ast.literal_eval(done.stdout)
+    assert name == "1"
+    assert set(found) <= {1}
 
 
 @pytest.mark.sfm

@@ -124,7 +124,7 @@ def meant_for(uri: str) -> str | None:
 
     ``uri``: of a recording that can be opened. Raises SourceError for a folder whose layout is not known.
     """
-    from gsstream.input.recordings.open import LAYOUTS, detect
+    from gsstream.input.recordings.detect import LAYOUTS, detect
     from gsstream.recipe.shipped import OF_LAYOUT
 
     layout, colon, _ = uri.partition(":")

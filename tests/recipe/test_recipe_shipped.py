@@ -8,7 +8,7 @@ import pytest
 
 from gsstream.cli.main import run_command
 from gsstream.core.errors import RecipeError, UnknownName
-from gsstream.input.recordings.open import LAYOUTS
+from gsstream.input.recordings.detect import LAYOUTS
 from gsstream.recipe.load import ResolvedRecipe, resolve_recipe
 from gsstream.recipe.shipped import FOLDER, OF_LAYOUT, names, recipe_file
 

@@ -9,9 +9,10 @@ from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
 from gsstream.input.prepare.raw import RawCamera, find_cameras
 from gsstream.input.recordings.clips import Clip, ImageClip
+from gsstream.input.recordings.detect import LAYOUTS, detect, layouts_of
 from gsstream.input.recordings.distortion import Lens as Distortion
 from gsstream.input.recordings.layouts import declared
-from gsstream.input.recordings.open import LAYOUTS, detect, layouts_of, read_layout
+from gsstream.input.recordings.open import read_layout
 from gsstream.input.recordings.recorded import Recording, check_sizes
 from gsstream.input.recordings.sync import align
 from gsstream.input.seeds.mapping import Lens

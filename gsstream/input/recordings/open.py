@@ -2,29 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from gsstream.core.errors import SourceError
 from gsstream.core.install_hints import install_part
 from gsstream.input.recordings.base import Source
-from gsstream.input.recordings.clips import prepare_command
+from gsstream.input.recordings.detect import LAYOUTS, detect, reader
 from gsstream.input.recordings.recorded import RecordedSource, Recording
 
 DEMO_FOLDER = Path(__file__).parent / "demo" / "pickblocks_tiny_160"
-#: Name -> (module in ``layouts``, what it looks like).
-LAYOUTS = {
-    "folder": ("declared", "cameras.json"),
-    "n3dv": ("n3dv", "cam00.mp4 ... or cam00/, and poses_bounds.npy"),
-    "meetroom": ("meetroom", "cam_0.mp4 ... or cam_0/, and poses_bounds.npy"),
-    "enerf": ("easymocap", "intri.yml, extri.yml, images/00/"),
-    "panoptic": ("panoptic", "train_meta.json, ims/"),
-    "colmap": ("colmap", "sparse/0/ and images/ or videos/"),
-    "nerfstudio": ("nerfstudio", "transforms.json"),
-    "calibrated": ("calibrated", "videos or images/, and a calibration of Qualisys, Caliscope, ..."),
-}
 _KNOWN = (
     "'demo' (a small recording inside the package), "
     "'synthetic:' with options such as 'synthetic:frames=40&views=8' (an analytic scene of any length), "
@@ -78,38 +65,9 @@ def _exists(folder: Path) -> bool:
         raise SourceError(f"source {str(folder)[:200]!r} cannot be a path: {error}") from error
 
 
-def _reader(name: str) -> Any:
-    return importlib.import_module(f"gsstream.input.recordings.layouts.{LAYOUTS[name][0]}")
-
-
-def layouts_of(folder: Path) -> list[str]:
-    """Return the names of the layouts that the files of a folder fit; "folder" alone where there is a cameras.json."""
-    if _reader("folder").looks_like(folder):
-        return ["folder"]
-    return [name for name in LAYOUTS if _reader(name).looks_like(folder)]
-
-
-def detect(folder: Path) -> str:
-    """Return the name of the layout of a folder; "folder" for one with cameras.json, which always counts.
-
-    Raises SourceError when none fits, saying what would, or when several do, saying how to choose.
-    """
-    found = layouts_of(folder)
-    if len(found) == 1:
-        return found[0]
-    if found:
-        told = "; ".join(f"{name} ({LAYOUTS[name][1]})" for name in found)
-        raise SourceError(f"{folder}: the files fit several layouts: {told}. Say which: --source {found[0]}:{folder}")
-    known = "; ".join(f"{name}: {looks}" for name, (_, looks) in LAYOUTS.items())
-    raise SourceError(
-        f"{folder}: no known layout. Expected one of these: {known}. Videos or images without a "
-        f"calibration: {prepare_command(str(folder))}"
-    )
-
-
 def read_layout(name: str, folder: Path) -> Recording:
     """Read a folder as the layout ``name``. Raises SourceError when it is none, or a faulty one."""
     if not folder.is_dir():
         raise SourceError(f"{folder}: no such folder; expected {LAYOUTS[name][1]}")
-    recording: Recording = _reader(name).read(folder)
+    recording: Recording = reader(name).read(folder)
     return replace(recording, folder=folder)

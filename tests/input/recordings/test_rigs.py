@@ -13,7 +13,8 @@ from PIL import Image
 
 from gsstream.core.errors import SourceError
 from gsstream.input.prepare.given import read_raw
-from gsstream.input.recordings.open import detect, open_source, read_layout
+from gsstream.input.recordings.detect import detect
+from gsstream.input.recordings.open import open_source, read_layout
 from gsstream.input.recordings.options import DataOptions
 from gsstream.input.recordings.poses import from_rotation_vector, invert
 from gsstream.input.recordings.transformed import transformed

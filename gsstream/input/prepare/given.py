@@ -10,22 +10,22 @@ from gsstream.core.shapes import FloatArray
 from gsstream.input.prepare.raw import RawCamera, find_cameras
 from gsstream.input.recordings.clips import Clip, ImageClip
 from gsstream.input.recordings.detect import LAYOUTS, detect, layouts_of
-from gsstream.input.recordings.distortion import Lens as Distortion
 from gsstream.input.recordings.layouts import declared
+from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.open import read_layout
 from gsstream.input.recordings.recorded import Recording, check_sizes
 from gsstream.input.recordings.sync import align
-from gsstream.input.seeds.mapping import Lens
 
 
 @dataclass(frozen=True, slots=True)
 class GivenRig:
-    """A calibration: ``viewmats`` [C, 4, 4], and ``lenses`` in pixels of each camera's own pictures.
+    """A calibration: ``viewmats`` [C, 4, 4], ``Ks`` [C, 3, 3] and ``lenses``, for pixels of each camera's own pictures.
 
     ``test``: ids of the test cameras, which never train.
     """
 
     viewmats: FloatArray
+    Ks: FloatArray
     lenses: tuple[Lens, ...]
     test: tuple[str, ...]
     fps: float
@@ -57,10 +57,10 @@ def _taken(recording: Recording) -> tuple[list[RawCamera], GivenRig]:
     ]
     if len(cameras) < 2:
         raise SourceError(f"{recording.where}: cameras found: {len(cameras)}; expected at least two")
-    lenses = tuple(_lens(K, recording.lenses.get(name)) for name, K in zip(rig.ids, rig.Ks, strict=True))
+    lenses = tuple(recording.lenses.get(name, Lens("radial", ())) for name in rig.ids)
     fps = beside.fps or recording.fps
     return cameras, GivenRig(
-        viewmats=rig.viewmats, lenses=lenses, test=recording.test, fps=fps, licence=recording.licence
+        viewmats=rig.viewmats, Ks=rig.Ks, lenses=lenses, test=recording.test, fps=fps, licence=recording.licence
     )
 
 
@@ -72,14 +72,3 @@ def _camera(name: str, clip: Clip, span: range) -> RawCamera:
         if files
         else RawCamera(name=name, files=(), size=clip.size, clip=clip, span=span)
     )
-
-
-def _lens(K: FloatArray, distortion: Distortion | None) -> Lens:
-    """The lens by the names and in the order of COLMAP."""
-    pinhole = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-    if distortion is None:
-        return Lens("PINHOLE", pinhole)
-    k = (*distortion.k, *(0.0,) * 6)
-    if distortion.kind == "fisheye":
-        return Lens("OPENCV_FISHEYE", (*pinhole, *k[:4]))
-    return Lens("FULL_OPENCV", (*pinhole, *k[:2], *distortion.p, *k[2:6]))

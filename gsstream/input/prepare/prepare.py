@@ -22,11 +22,12 @@ from gsstream.core.frame import PointCloud
 from gsstream.core.names import child
 from gsstream.core.progress import Tell, silent
 from gsstream.core.shapes import FloatArray
+from gsstream.core.storage import to_bytes
 from gsstream.input.prepare.given import GivenRig, read_raw
 from gsstream.input.prepare.raw import RawCamera, first_frames
-from gsstream.input.prepare.undistort import Undistortion, undistortion
 from gsstream.input.recordings.calibration import CALIBRATION_FILE, SCHEMA
-from gsstream.input.seeds.mapping import Lens, Mapping, reconstruct, triangulate
+from gsstream.input.recordings.lens import Lens, Undistortion, undistortion
+from gsstream.input.seeds.mapping import Mapping, reconstruct, triangulate
 from gsstream.input.seeds.thinning import thin_points
 
 #: Fewer points than this are none: a run searches for its own.
@@ -92,8 +93,8 @@ def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say, tell:
             "The views may be too far apart or show too little texture: give poses (cameras.json beside the pictures)"
         )
     say(f"placed {len(kept)} of {len(names)} cameras, {len(mapping.xyz)} points")
-    lenses = _pinholes([cameras[i] for i in kept], mapping, kept, options)
     target = _target([cameras[i] for i in kept], options)
+    lenses = _pinholes([cameras[i] for i in kept], mapping.Ks[kept], [mapping.lenses[i] for i in kept], target)
     rig = Cameras(tuple(names[i] for i in kept), mapping.viewmats[kept], np.stack([K for K, _ in lenses]), *target)
     found = _points(mapping, rig, options)
     points, bounds = found if found else (None, None)
@@ -139,31 +140,19 @@ def _map(
     training = [i for i in range(len(cameras)) if i not in held]
     size = _smallest([cameras[i] for i in training])
     tell("undistorting frame 0", 0, 0)
-    made: dict[tuple[Lens, tuple[int, int]], Undistortion] = {}
-    flat = [_flat(images[i], cameras[i].size, known.lenses[i], target=size, made=made) for i in training]
+    chosen, lenses = [cameras[i] for i in training], [known.lenses[i] for i in training]
+    flat = _pinholes(chosen, known.Ks[training], lenses, size)
+    shown = [images[i] if made is None else made.apply(images[i]) for i, (_, made) in zip(training, flat, strict=True)]
     rig = Cameras(
-        tuple(cameras[i].name for i in training), known.viewmats[training], np.stack([K for K, _ in flat]), *size
+        tuple(camera.name for camera in chosen), known.viewmats[training], np.stack([K for K, _ in flat]), *size
     )
-    found = triangulate(np.stack([image for _, image in flat]), rig, tell=tell)
+    found = triangulate(np.stack(shown), rig, tell=tell)
     # The test cameras' poses are given; nothing of theirs is used.
     error, seen = np.full(len(cameras), np.nan), np.zeros(len(cameras), np.int64)
     error[training], seen[training] = found.camera_error, found.camera_points
-    return replace(found, viewmats=known.viewmats, lenses=known.lenses, camera_error=error, camera_points=seen)
-
-
-def _flat(
-    image: FloatArray,
-    size: tuple[int, int],
-    lens: Lens,
-    target: tuple[int, int],
-    made: dict[tuple[Lens, tuple[int, int]], Undistortion],
-) -> tuple[FloatArray, FloatArray]:
-    """(K, picture) of a pinhole camera of the target size; ``made`` keeps what equal lenses share."""
-    if not lens.distorts and size == target:
-        return lens.K, image
-    if (lens, size) not in made:
-        made[lens, size] = undistortion(lens, size, target)
-    return made[lens, size].K, made[lens, size].apply(image)
+    return replace(
+        found, viewmats=known.viewmats, Ks=known.Ks, lenses=known.lenses, camera_error=error, camera_points=seen
+    )
 
 
 def _smallest(cameras: list[RawCamera]) -> tuple[int, int]:
@@ -181,20 +170,18 @@ def _target(cameras: list[RawCamera], options: PrepareOptions) -> tuple[int, int
 
 
 def _pinholes(
-    cameras: list[RawCamera], mapping: Mapping, kept: list[int], options: PrepareOptions
+    cameras: Sequence[RawCamera], Ks: FloatArray, lenses: Sequence[Lens], target: tuple[int, int]
 ) -> list[tuple[FloatArray, Undistortion | None]]:
     """(K, how to undistort) per camera; None: its pictures are taken over as they are."""
-    target = _target(cameras, options)
-    made: dict[tuple[Lens, tuple[int, int]], Undistortion] = {}
+    made: dict[tuple[Lens, bytes, tuple[int, int]], Undistortion] = {}  # equal lenses share it
     out: list[tuple[FloatArray, Undistortion | None]] = []
-    for camera, index in zip(cameras, kept, strict=True):
-        lens = mapping.lenses[index]
-        if not lens.distorts and target == camera.size:
-            out.append((lens.K, None))
+    for camera, K, lens in zip(cameras, Ks, lenses, strict=True):
+        if lens.is_identity and target == camera.size:
+            out.append((K, None))
             continue
-        key = (lens, camera.size)
+        key = (lens, K.tobytes(), camera.size)
         if key not in made:
-            made[key] = undistortion(lens, camera.size, target)
+            made[key] = undistortion(lens, K, camera.size, target=target, where=f"camera {camera.name!r}")
         out.append((made[key].K, made[key]))
     return out
 
@@ -240,8 +227,7 @@ def _write_pictures(
         count = 0
         for count, image in enumerate(camera.frames(options.frames), start=1):
             shown = image if lens is None else lens.apply(image)
-            pixels = np.round(np.clip(shown, 0, 1) * 255).astype(np.uint8)
-            Image.fromarray(pixels).save(folder / f"{count - 1:06d}.png", compress_level=3)
+            Image.fromarray(to_bytes(shown)).save(folder / f"{count - 1:06d}.png", compress_level=3)
         counts.append(count)
     return counts
 

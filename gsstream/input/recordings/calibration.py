@@ -17,7 +17,7 @@ from gsstream.core.install_hints import page
 from gsstream.core.names import check_camera_ids
 from gsstream.input.recordings.base import Split
 from gsstream.input.recordings.clips import VIDEO_SUFFIXES, prepare_command
-from gsstream.input.recordings.distortion import Lens
+from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.rigs.camera import opencv_lens
 
 SCHEMA = "opencv-multiview-1"

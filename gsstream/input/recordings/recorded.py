@@ -18,8 +18,8 @@ from gsstream.core.storage import packed, to_bytes, unpacked
 from gsstream.input.recordings.base import PointKind, Source, SourceInfo, Split, assembled, check_index
 from gsstream.input.recordings.clips import Clip, prepare_command
 from gsstream.input.recordings.depth_maps import FOLDER
-from gsstream.input.recordings.distortion import Lens, Undistorter, pinhole_intrinsics
 from gsstream.input.recordings.images import scaled_size
+from gsstream.input.recordings.lens import Lens, Undistortion, undistortion
 from gsstream.input.recordings.sync import align
 
 
@@ -62,8 +62,8 @@ class RecordedSource(Source):
         rig = _checked(recording, uri)
         self._target = scaled_size((rig.width, rig.height), scale)
         self._alignment = align(recording.name, recording.clips)
-        self._undistort: dict[str, Undistorter] = {}
-        flat = self._flattened(rig).scaled(*self._target)
+        self._undistort: dict[str, Undistortion] = {}
+        flat = self._flattened(rig)
         test = [i for i, name in enumerate(rig.ids) if name in recording.test]
         train = [i for i, name in enumerate(rig.ids) if name not in recording.test]
         if not train:
@@ -98,7 +98,7 @@ class RecordedSource(Source):
         image = self._recording.clips[camera].read(index + self._alignment.skip[camera], self._target)
         if camera not in self._undistort:
             return packed(image)
-        flat = self._undistort[camera](unpacked(image))
+        flat = self._undistort[camera].apply(unpacked(image))
         return to_bytes(flat) if image.dtype == np.uint8 else packed(flat)
 
     def stored_frame(self, index: int, split: Split = "train") -> Frame:
@@ -132,17 +132,17 @@ class RecordedSource(Source):
             clip.close()
 
     def _flattened(self, rig: Cameras) -> Cameras:
-        """The rig with the intrinsics of the pinhole images that are delivered."""
-        Ks = rig.Ks.copy()
-        scale = np.diag([self._target[0] / rig.width, self._target[1] / rig.height, 1.0])
+        """The rig of the pinhole images that are delivered."""
+        Ks, flat = rig.Ks, rig.scaled(*self._target)
+        pinholes = flat.Ks.copy()
         for i, name in enumerate(rig.ids):
             lens = self._recording.lenses.get(name)
             if lens is None or lens.is_identity:
                 continue
             where = f"{self._recording.where}: camera {name!r}"
-            Ks[i] = pinhole_intrinsics(lens, rig.Ks[i], (rig.width, rig.height), where)
-            self._undistort[name] = Undistorter(lens, scale @ rig.Ks[i], scale @ Ks[i], self._target)
-        return replace(rig, Ks=Ks)
+            made = undistortion(lens, Ks[i], (rig.width, rig.height), target=self._target, where=where)
+            self._undistort[name], pinholes[i] = made, made.K
+        return replace(flat, Ks=pinholes)
 
 
 def _checked(recording: Recording, uri: str) -> Cameras:

@@ -260,21 +260,7 @@ def _register(database: Path, images: Any, best: Any, index: int, camera: Any, r
     return found["cam_from_world"], float(off.mean())
 
 
-def undistortion(folder: Path) -> None:
-    """Find where pinhole rays fall on the image of a real lens.
-
-    The lens is ``folder/lens.npz`` (model, params, size, rays [M, 2]).
-
-    Writes ``folder/places.npz``: uv [M, 2] pixels.
-    """
-    with np.load(folder / "lens.npz") as lens:
-        width, height = map(int, lens["size"])
-        camera = pycolmap.Camera(model=str(lens["model"]), width=width, height=height, params=lens["params"])
-        rays = np.hstack([lens["rays"], np.ones((len(lens["rays"]), 1))])
-    np.savez(folder / "places.npz", uv=np.asarray(camera.img_from_cam(rays), np.float64))
-
-
-TASKS = {"triangulate": triangulate, "match": match, "reconstruct": reconstruct, "undistortion": undistortion}
+TASKS = {"triangulate": triangulate, "match": match, "reconstruct": reconstruct}
 
 if __name__ == "__main__":
     import sys

@@ -15,30 +15,11 @@ from gsstream.core.errors import InputError
 from gsstream.core.install_hints import page
 from gsstream.core.progress import Tell, silent
 from gsstream.core.shapes import BoolArray, FloatArray, IntArray
+from gsstream.input.recordings.lens import Lens, from_colmap
 from gsstream.input.seeds.sfm import run_pycolmap, write_images, write_rig
 
-#: Number of focal lengths among the parameters of a lens model; the principal point follows, then the distortion.
-LENSES = {"PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "OPENCV_FISHEYE": 2, "FULL_OPENCV": 2}
-
-
-@dataclass(frozen=True, slots=True)
-class Lens:
-    """``model``: a key of LENSES (COLMAP's names); ``params``: focal lengths, principal point, distortion."""
-
-    model: str
-    params: tuple[float, ...]
-
-    @property
-    def K(self) -> FloatArray:
-        """[3, 3] intrinsics without distortion, pixels."""
-        count = LENSES[self.model]
-        fx, fy = self.params[0], self.params[count - 1]
-        return np.array([[fx, 0, self.params[count]], [0, fy, self.params[count + 1]], [0, 0, 1.0]])
-
-    @property
-    def distorts(self) -> bool:
-        """Whether any coefficient of distortion is not zero (a fisheye lens distorts with none)."""
-        return self.model == "OPENCV_FISHEYE" or any(self.params[LENSES[self.model] + 2 :])
+#: Lens models by COLMAP's names.
+LENSES = ("PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV")
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,13 +28,14 @@ class Mapping:
 
     Arguments:
         viewmats: [C, 4, 4]; NaN where a camera was not registered.
-        lenses: C lenses.
+        Ks, lenses: [C, 3, 3] and C lenses, for pixels of each camera's own picture.
         xyz, rgb, error, track: P points, their colours (uint8), reprojection errors (pixels) and numbers of views.
         camera_error: [C] mean reprojection error, pixels; NaN where nothing is known.
         camera_points: [C] points that each camera sees.
     """
 
     viewmats: FloatArray
+    Ks: FloatArray
     lenses: tuple[Lens, ...]
     xyz: FloatArray
     rgb: IntArray
@@ -95,8 +77,8 @@ def reconstruct(
                 raise InputError(_apart(result["pairs"], result["counts"], names))
         with np.load(folder / "points.npz") as result:
             found = dict(result)
-    lenses = tuple(Lens(model, tuple(map(float, params))) for params in found["cameras"])
-    return _mapping(found, found["viewmats"], lenses)
+    Ks, lenses = zip(*(from_colmap(model, params, "structure from motion") for params in found["cameras"]), strict=True)
+    return _mapping(found, found["viewmats"], np.stack(Ks), lenses)
 
 
 def _apart(pairs: IntArray, counts: IntArray, names: Sequence[str]) -> str:
@@ -122,11 +104,10 @@ def triangulate(images: FloatArray, cameras: Cameras, *, timeout: float = 1800.0
         run_pycolmap("triangulate", folder, timeout, tell)
         with np.load(folder / "points.npz") as result:
             found = dict(result)
-    lenses = tuple(Lens("PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2])) for K in cameras.Ks)
-    return _mapping(found, cameras.viewmats, lenses)
+    return _mapping(found, cameras.viewmats, cameras.Ks, (Lens("radial", ()),) * len(cameras))
 
 
-def _mapping(found: dict[str, Any], viewmats: FloatArray, lenses: tuple[Lens, ...]) -> Mapping:
+def _mapping(found: dict[str, Any], viewmats: FloatArray, Ks: FloatArray, lenses: tuple[Lens, ...]) -> Mapping:
     count = len(lenses)
     seen = np.bincount(found["seen_image"], minlength=count)
     total = np.bincount(found["seen_image"], weights=found["seen_error"], minlength=count)
@@ -135,6 +116,7 @@ def _mapping(found: dict[str, Any], viewmats: FloatArray, lenses: tuple[Lens, ..
         error = np.where(seen > 0, error, found["held_error"])
     return Mapping(
         viewmats=viewmats,
+        Ks=Ks,
         lenses=lenses,
         xyz=found["xyz"],
         rgb=found["rgb"],
@@ -143,14 +125,3 @@ def _mapping(found: dict[str, Any], viewmats: FloatArray, lenses: tuple[Lens, ..
         camera_error=error,
         camera_points=seen,
     )
-
-
-def lens_places(lens: Lens, size: tuple[int, int], rays: FloatArray) -> FloatArray:
-    """Return pixels [M, 2] at which a lens shows the directions ``rays`` [M, 2] (x / z, y / z)."""
-    with tempfile.TemporaryDirectory(prefix="gsstream-lens-") as name:
-        folder = Path(name)
-        np.savez(folder / "lens.npz", model=lens.model, params=np.array(lens.params), size=np.array(size), rays=rays)
-        run_pycolmap("undistortion", folder, 120.0)
-        with np.load(folder / "places.npz") as result:
-            places: FloatArray = result["uv"]
-    return places

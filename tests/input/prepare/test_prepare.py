@@ -7,10 +7,12 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +21,8 @@ from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError, SourceError
 from gsstream.input.prepare.prepare import PrepareOptions, prepare
 from gsstream.input.prepare.raw import find_cameras
-from gsstream.input.recordings.open import open_source
+from gsstream.input.recordings.lens import from_colmap, undistortion
+from gsstream.input.recordings.open import DEMO_FOLDER, open_source
 from tests.input.prepare.bad_scenes import save
 from tests.input.recordings.scenes import write_video
 
@@ -99,19 +102,15 @@ def test_known_poses_are_kept_and_points_triangulated(tmp_path: Path) -> None:
     assert np.abs(small - blocks).max() < 1 / 255, "shrunk pictures are means: no raw pixel is skipped"
 
 
-@pytest.mark.sfm
-@needs_pycolmap
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
 def test_undistorted_pixels_come_from_where_the_lens_shows_them(model: str) -> None:
-    from gsstream.input.prepare.undistort import undistortion
-    from gsstream.input.seeds.mapping import Lens
-
-    lens = Lens(model, (90.0, 95.0, 62.0, 47.0, -0.12, 0.02, 0.003, -0.002))
-    made = undistortion(lens, (120, 90), (120, 90))
+    params = (90.0, 95.0, 62.0, 47.0, -0.12, 0.02, 0.003, -0.002)
+    K, lens = from_colmap(model, params, "here")
+    made = undistortion(lens, K, (120, 90), target=(120, 90), where="here")
     x = (np.arange(120) + 0.5 - made.K[0, 2]) / made.K[0, 0]
     y = (np.arange(90) + 0.5 - made.K[1, 2]) / made.K[1, 1]
     x, y = np.meshgrid(x, y)
-    k1, k2, p1, p2 = lens.params[4:]
+    k1, k2, p1, p2 = params[4:]
     r2 = x**2 + y**2
     if model == "OPENCV":  # Brown's model, as in the documentation of OpenCV
         radial = 1 + k1 * r2 + k2 * r2**2
@@ -122,13 +121,44 @@ def test_undistorted_pixels_come_from_where_the_lens_shows_them(model: str) -> N
         bent = angle * (1 + k1 * angle**2 + k2 * angle**4 + p1 * angle**6 + p2 * angle**8) / r
         u, v = x * bent, y * bent
     expected = np.stack([90 * u + 62, 95 * v + 47], axis=-1)
-    assert np.abs(made.places - expected).max() < 1e-6
+    assert np.abs(made.places - expected).max() < 1e-5, "float32"
     assert (made.places >= 0).all()
     assert (made.places <= (120, 90)).all()
     ramp = np.stack(np.meshgrid(np.arange(120) + 0.5, np.arange(90) + 0.5), axis=-1) / 120
     image = np.concatenate([ramp, ramp[..., :1]], axis=-1).astype(np.float32)
     inner = (slice(2, -2), slice(2, -2), slice(2))
     assert np.abs(made.apply(image)[inner] - made.places[2:-2, 2:-2] / 120).max() < 1e-4
+
+
+LENS_TABLE: dict[str, dict[str, Any]] = {
+    "one radial": {"distortion": [-0.1, 0.0, 0.0, 0.0]},
+    "brown": {"distortion": [-0.12, 0.03, 0.001, -0.0005]},
+    "pincushion": {"distortion": [0.08, -0.02, 0.0, 0.0]},
+    "three radial": {"distortion": [-0.1, 0.02, 0.0, 0.001, 0.01]},
+    "rational": {"distortion": [-0.2, 0.05, 0.003, -0.002, 0.01, 0.02, -0.01, 0.003]},
+    "fisheye": {"distortion": [0.02, -0.005, 0.0, 0.0], "fisheye": True},
+}
+
+
+@pytest.mark.sfm
+@needs_pycolmap
+@pytest.mark.parametrize("lens", LENS_TABLE)
+def test_a_lens_that_is_read_and_one_that_is_prepared_give_one_pinhole_and_its_pictures(
+    tmp_path: Path, lens: str
+) -> None:
+    """Over lens models: equal intrinsics and equal bytes."""
+    folder = tmp_path / "raw"
+    shutil.copytree(DEMO_FOLDER, folder)
+    data = json.loads((folder / "cameras.json").read_text())
+    for camera in data["cameras"]:
+        camera |= LENS_TABLE[lens]
+    (folder / "cameras.json").write_text(json.dumps(data))
+    prepare(folder, tmp_path / "made", PrepareOptions(frames=1), quiet)
+    read, made = open_source(str(folder)), open_source(str(tmp_path / "made"))
+    assert read.info.train.Ks[0, 0, 0] != open_source("demo").info.train.Ks[0, 0, 0]
+    for split in ("train", "test"):
+        assert np.allclose(getattr(read.info, split).Ks, getattr(made.info, split).Ks, rtol=1e-12)
+        assert np.array_equal(read.stored_frame(0, split).images, made.stored_frame(0, split).images)
 
 
 def raw_videos(folder: Path, frames: int, world: str) -> dict[str, list[np.ndarray]]:

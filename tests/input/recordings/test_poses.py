@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import SIZE, make_world, quaternion, write_colmap, write_enerf
 
-from gsstream.input.recordings.distortion import Lens, Undistorter, pinhole_intrinsics
+from gsstream.input.recordings.lens import Lens, undistortion
 from gsstream.input.recordings.open import open_source
 from gsstream.input.recordings.poses import (
     OPENGL_TO_OPENCV,
@@ -95,7 +95,7 @@ lenses = st.one_of(
 @given(lenses)
 @settings(max_examples=60, deadline=None)
 def test_the_pinhole_image_is_full_and_as_wide_as_possible(lens: Lens) -> None:
-    pinhole = pinhole_intrinsics(lens, K, SIZE, "here")
+    pinhole = undistortion(lens, K, SIZE, target=SIZE, where="here").K
     np.testing.assert_array_equal(pinhole[:2, 2], K[:2, 2])
     u, v = np.meshgrid(np.linspace(0, SIZE[0], 33), np.linspace(0, SIZE[1], 23))
 
@@ -126,8 +126,8 @@ def test_a_smooth_picture_is_found_where_the_lens_put_it(lens: Lens) -> None:
     if np.abs(np.stack(lens.distort(x, y)) - np.stack([at_x, at_y])).max() > 1e-6:
         return  # the corner lies where this lens has no inverse; the pinhole image does not reach it
     recorded = np.stack([x, y, np.zeros_like(x)], -1).astype(np.float32)
-    pinhole = pinhole_intrinsics(lens, calibration, size, "here")
-    flat = Undistorter(lens, calibration, pinhole, size)(recorded)
+    made = undistortion(lens, calibration, size, target=size, where="here")
+    pinhole, flat = made.K, made.apply(recorded)
     np.testing.assert_allclose(flat[1:-1, 1:-1, 0], ((fine_u - pinhole[0, 2]) / pinhole[0, 0])[1:-1, 1:-1], atol=2e-3)
     np.testing.assert_allclose(flat[1:-1, 1:-1, 1], ((fine_v - pinhole[1, 2]) / pinhole[1, 1])[1:-1, 1:-1], atol=2e-3)
 
@@ -178,11 +178,12 @@ def test_readers_deliver_pinhole_cameras_for_distorted_ones(tmp_path: Path) -> N
     source = open_source(str(write_enerf(tmp_path / "enerf", world, distortion=bent)))
     lens = Lens("radial", (-0.15, 0.02, 0.0), (0.001, -0.001))
     for i, K_stored in enumerate(world.Ks[1:]):
-        expected = pinhole_intrinsics(lens, K_stored, SIZE, "here")
+        made = undistortion(lens, K_stored, SIZE, target=SIZE, where="here")
+        expected = made.K
         np.testing.assert_allclose(source.info.train.Ks[i], expected, atol=1e-9)
         assert expected[0, 0] != K_stored[0, 0]
         picture = (world.pictures[0, i + 1] / 255).astype(np.float32)
-        flat = Undistorter(lens, K_stored, expected, SIZE)(picture)
+        flat = made.apply(picture)
         np.testing.assert_allclose(source.frame(0).images[i], flat, atol=0.51 / 255)
         assert source.stored_image(0, source.info.train.ids[i]).dtype == np.uint8, (
             "it has the levels that it is made of"

@@ -17,9 +17,7 @@ from gsstream.core.errors import SourceError
 from gsstream.core.frame import PointCloud
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, images_in
-from gsstream.input.recordings.distortion import Lens
 from gsstream.input.recordings.layouts.colmap_model import (
-    ModelCamera,
     ModelImage,
     has_model,
     has_points,
@@ -27,6 +25,7 @@ from gsstream.input.recordings.layouts.colmap_model import (
     read_images,
     read_points,
 )
+from gsstream.input.recordings.lens import from_colmap
 from gsstream.input.recordings.poses import from_quaternion
 from gsstream.input.recordings.recorded import Recording, SeenPoints
 
@@ -58,10 +57,10 @@ def read(folder: Path) -> Recording:
             raise SourceError(f"{model}: image {image.name!r} uses camera {image.camera}, which is not in the model")
         camera = cameras[image.camera]
         poses.append(from_quaternion(_unit(model, image), image.translation))
-        K, lens = intrinsics(camera, f"{model}: camera {image.camera}")
+        K, lens = from_colmap(camera.model, camera.params, f"{model}: camera {image.camera}")
         Ks.append(K)
         sizes[name] = (camera.width, camera.height)
-        if lens is not None and not lens.is_identity:
+        if not lens.is_identity:
             lenses[name] = lens
     rig = Cameras(tuple(names), np.stack(poses), np.stack(Ks), *sizes[names[0]])
     clips = {name: _clip(folder, name, images[number].name) for name, number in zip(names, numbers, strict=True)}
@@ -74,32 +73,6 @@ def read(folder: Path) -> Recording:
         sizes=sizes,
         points=lambda _: _points(model, numbers),
     )
-
-
-def intrinsics(camera: ModelCamera, where: str) -> tuple[FloatArray, Lens | None]:
-    """Return K [3, 3] and the distortion of a COLMAP camera.
-
-    Raises SourceError for models whose lens gsstream does not know.
-    """
-    p = camera.params
-    single = camera.model.startswith(("SIMPLE_", "RADIAL"))
-    fx, fy, cx, cy = (p[0], p[0], p[1], p[2]) if single else p[:4]
-    rest = p[3:] if single else p[4:]
-    lens: Lens | None
-    match camera.model:
-        case "SIMPLE_PINHOLE" | "PINHOLE":
-            lens = None
-        case "SIMPLE_RADIAL" | "RADIAL":
-            lens = Lens("radial", rest)
-        case "OPENCV":
-            lens = Lens("radial", rest[:2], (rest[2], rest[3]))
-        case "FULL_OPENCV":
-            lens = Lens("radial", (*rest[:2], *rest[4:8]), (rest[2], rest[3]))
-        case "OPENCV_FISHEYE" | "SIMPLE_RADIAL_FISHEYE" | "RADIAL_FISHEYE":
-            lens = Lens("fisheye", rest)
-        case _:
-            raise SourceError(f"{where}: the model {camera.model} is not supported; undistort with COLMAP's own tool")
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), lens
 
 
 def _unit(model: Path, image: ModelImage) -> FloatArray:

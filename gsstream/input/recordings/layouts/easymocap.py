@@ -17,7 +17,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, folder_clip
-from gsstream.input.recordings.distortion import Lens
+from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.poses import from_pixel_centers, from_rotation_vector
 from gsstream.input.recordings.recorded import Recording
 from gsstream.input.recordings.rigs.opencv_yaml import load_storage

@@ -26,8 +26,8 @@ from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.calibration import read_json
 from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip
-from gsstream.input.recordings.distortion import Lens
 from gsstream.input.recordings.layouts.nerfstudio_groups import group_entries
+from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.pointfiles import read_ply_points
 from gsstream.input.recordings.poses import from_opengl
 from gsstream.input.recordings.recorded import Recording, SeenPoints

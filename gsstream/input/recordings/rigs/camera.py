@@ -10,7 +10,7 @@ import numpy as np
 
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.distortion import Lens
+from gsstream.input.recordings.lens import Lens
 
 #: Pictures of a size that differs by less than this share lost or gained a border, and were not scaled.
 BORDER = 0.03

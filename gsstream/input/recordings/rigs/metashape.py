@@ -14,7 +14,7 @@ import numpy as np
 
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.distortion import Lens
+from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.poses import invert
 from gsstream.input.recordings.rigs.camera import RigCamera
 

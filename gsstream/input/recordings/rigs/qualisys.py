@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from gsstream.core.errors import SourceError
-from gsstream.input.recordings.distortion import Lens
+from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.poses import OPENGL_TO_OPENCV, from_pixel_centers
 from gsstream.input.recordings.rigs.camera import RigCamera
 

@@ -6,10 +6,15 @@ import functools
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from gsstream.core.changes import motion
+from gsstream.core.changes import residual as residual_change
 from gsstream.core.errors import InputError
 from gsstream.packet.conformance import Case, Outcome, by_feature, judge, load_cases, play_here, play_with
 
@@ -139,6 +144,46 @@ def test_a_decoder_may_leave_out_the_meta_and_the_field_and_nothing_else() -> No
     assert judge(rows, Outcome(("without rows", *rows.frames, more), 0)).problem
     assert judge(rows, Outcome((*rows.frames, "unsupported rows"), 3)).problem
     assert judge(by_name["field-marked"], Outcome((by_name["field-marked"].frames[0], "unsupported field"), 3)).left_out
+
+
+def wide_residual(symbols: Any, step: float, decoder: Any) -> Any:
+    """As gsstream.core.changes.residual.decode_residual, in float64 with one rounding at the end."""
+    latent = symbols.astype(np.float64) * float(np.float32(step))
+    return (latent if decoder is None else latent @ decoder.astype(np.float64)).astype(np.float32)
+
+
+def backwards(values: Any, group: Any, number: int) -> Any:
+    """As the means of gsstream.core.changes.motion, with rows added up from the last to the first."""
+    return MEANS(values[::-1], group[::-1], number)
+
+
+def sparing(gaussians: Any, stored: Any, residual: Any) -> Any:
+    """As apply_residual, for a decoder that leaves alone what does not change but for the sign of 0."""
+    after = APPLY(gaussians, stored, residual)
+    same = {n: np.where(a == getattr(gaussians, n), getattr(gaussians, n), a) for n, a in after.items()}
+    return replace(after, **same)
+
+
+def flushing(gaussians: Any, stored: Any, residual: Any) -> Any:
+    """As apply_residual, for a processor that takes subnormal numbers for 0."""
+    after = APPLY(gaussians, stored, residual)
+    return after.map(lambda a: np.where(np.abs(a) < np.finfo(np.float32).tiny, np.float32(0), a))
+
+
+MEANS, APPLY = motion._means, residual_change.apply_residual
+WRONG = {
+    "core.changes.residual.decode_residual": wide_residual, "core.changes.motion._means": backwards,
+    "core.changes.delta.apply_residual": sparing,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("place", "function"), [*WRONG.items(), ("core.changes.delta.apply_residual", flushing)])
+def test_the_suite_notices_arithmetic_of_another_order_or_width(
+    monkeypatch: pytest.MonkeyPatch, place: str, function: Any
+) -> None:
+    monkeypatch.setattr(f"gsstream.{place}", function)
+    cases = [case for case in CASES if {"rounding", "extremes", "decoder"} & set(case.features)]
+    assert [case for case in cases if judge(case, play_here(case.path)).problem]
 
 
 def test_the_table_counts_every_stream_once_for_each_feature() -> None:

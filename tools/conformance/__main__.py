@@ -21,6 +21,7 @@ from tools.conformance import (
     lying_rows,
     moving,
     residuals,
+    rounding,
 )
 from tools.conformance.tapes import Vector
 
@@ -29,7 +30,7 @@ FOLDER = Path(__file__).parents[2] / "tests" / "conformance"
 
 def all_vectors() -> Iterator[Vector]:
     """Every vector, in the order of the modules."""
-    sound = (keys, residuals, moving, edits)
+    sound = (keys, residuals, moving, edits, rounding)
     for module in (*sound, lying_files, lying_keys, lying_metas, lying_deltas, lying_moves, lying_rows):
         yield from module.vectors()
 

@@ -62,6 +62,7 @@ export class PlayerElement extends HTMLElement {
       loop: this.getAttribute("loop") !== "false",
       speed: Number(this.getAttribute("speed") ?? 1),
       limits: this.getAttribute("limits") !== "none",
+      early: this.early,
       beforeFrame: (seconds) => this.controls?.fly(seconds),
     });
     this.player.marks = this.hasAttribute("marks");
@@ -182,7 +183,7 @@ export class PlayerElement extends HTMLElement {
 
   _progress() {
     const { parts, player } = this;
-    if (!player || player.frame === null) return;
+    if (!player || player.frame === null || !player.source) return;
     parts.play.querySelector("path").setAttribute("d", player.playing ? PAUSE : PLAY);
     this.toggleAttribute("still", !player.source.live && player.buffer.last === player.first);
     parts.space.hidden = !this.hasAttribute("still");

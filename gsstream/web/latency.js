@@ -7,24 +7,26 @@ export class Latency {
   constructor() {
     this.waiting = new Map();
     this.frames = [];
-  }
-
-  /** The packet of a frame, written at `written`, came `now`. */
-  written(frame, written, now) {
-    this.waiting.set(frame, { frame, written, came: now - written });
-    if (this.waiting.size > KEPT) this.waiting.delete(this.waiting.keys().next().value);
+    this.ahead = this.joined = 0;
   }
 
   /**
-   * The picture of a frame was drawn `now`; frames before it that were not drawn will not be. What was written before
-   * the viewer came, `since`, is not late.
+   * The packet of a frame, written at `written`, came at `came`, by the server's clock, which is `ahead` of this one. What
+   * was written before the viewer came, `joined`, is not late.
    */
-  shown(frame, now, since) {
+  written({ frame, written, came, ahead, joined }) {
+    Object.assign(this, { ahead, joined });
+    this.waiting.set(frame, { frame, written, came: came - written });
+    if (this.waiting.size > KEPT) this.waiting.delete(this.waiting.keys().next().value);
+  }
+
+  /** The picture of a frame was drawn `now`; frames before it that were not drawn will not be. */
+  shown(frame, now) {
     const entry = this.waiting.get(frame);
     if (!entry) return;
     for (const known of this.waiting.keys()) if (known <= frame) this.waiting.delete(known);
-    if (entry.written < since) return;
-    this.frames = [...this.frames.slice(1 - KEPT), { ...entry, drawn: now - entry.written }];
+    if (entry.written < this.joined) return;
+    this.frames = [...this.frames.slice(1 - KEPT), { ...entry, drawn: now + this.ahead - entry.written }];
   }
 
   text() {

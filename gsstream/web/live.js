@@ -3,30 +3,24 @@
 import { FILE_HEADER, KIND, PACKET_HEADER, checkFileHeader, parseHeader } from "./container.js";
 import "./layers.js";
 import { PacketError } from "./errors.js";
-import { Latency } from "./latency.js";
 import { LiveSocket } from "./live-socket.js";
 
-/**
- * Milliseconds of decoding between two pictures: at least, and at most. Between them it may take as long as the picture
- * before took, or else a page that draws slowly would be later with every frame.
- */
-const BUDGET = 24;
-const CATCH_UP = 1000;
+/** Milliseconds of decoding after which what there is is shown, although more has come. */
+const CATCH_UP = 250;
 /** Milliseconds without a frame of which the viewer is told; longer where frames come seldom. */
 export const settings = { quiet: 10_000 };
 
-/** Stands where a recording has its buffer (see buffer.js); the player calls `feed` for every picture. */
+/** Stands where a recording has its buffer (see buffer.js); the stream calls `feed` when the page can show more. */
 export class LiveBuffer {
-  constructor(url, player) {
+  constructor(url, stream) {
     this.live = true;
     this.url = url;
-    this.player = player;
+    this.stream = stream;
     this.fps = 30;
     this.received = 0;
     this.first = null;
     this.last = null;
     this.lastLoaded = null;
-    this.latency = new Latency();
     this.queue = [];
     this.waiting = 0;
     /** Bytes that may wait to be decoded. A page that is not shown takes no more and catches up later. */
@@ -46,9 +40,7 @@ export class LiveBuffer {
         this._tell();
       },
     });
-    this.heard = () => (player.playing ? this.resume() : this.pause());
-    player.addEventListener("state", this.heard);
-    player.playing = true;
+    this.clock = setInterval(() => this._tell(), 500);
     this.socket.start();
   }
 
@@ -73,7 +65,7 @@ export class LiveBuffer {
   }
 
   dispose() {
-    this.player.removeEventListener("state", this.heard);
+    clearInterval(this.clock);
     this.socket.stop();
   }
 
@@ -84,41 +76,31 @@ export class LiveBuffer {
     return null;
   }
 
-  /** Decode what came. The newest state is drawn; of those before it none is, unless decoding takes long. */
+  /** Decode what came. The newest state is shown; of those before it none is, unless decoding takes long. */
   feed() {
-    const { player } = this;
-    if (!player.playing) return;
+    const { stream } = this;
+    if (!stream.playing || !stream.hungry) return;
     if (this.asleep && !this.queue.length) this.resume();
     const started = performance.now();
-    const most = Math.min(CATCH_UP, Math.max(BUDGET, started - (this.fed ?? started)));
-    this.fed = started;
     let decoded = false;
-    while (this.queue.length && performance.now() - started < most) {
+    while (this.queue.length && performance.now() - started < CATCH_UP) {
       const packet = this.queue.shift();
       this.waiting -= packet.data.length;
       decoded = this._decode(packet) || decoded;
     }
     this._tell();
-    if (!decoded) return;
-    player.invalidate();
-    player._say("frame");
-  }
-
-  /** A picture was drawn. */
-  shown(frame) {
-    const { ahead } = this.socket;
-    this.latency.shown(frame, Date.now() + ahead, this.joined + ahead);
+    if (decoded) stream.sendFrame();
   }
 
   _decode(packet) {
     if (this.broken && packet.header.kind !== KIND.key) return false;
     try {
-      this.player._take({ packet });
+      this.stream.take({ packet });
       this.broken = null;
       return true;
     } catch (error) {
       if (!(error instanceof PacketError)) {
-        this.player._stop(error);
+        this.stream.fail(error);
         return false;
       }
       this.broken = `${error.message}; the picture stands still until the next key packet.`;
@@ -145,8 +127,7 @@ export class LiveBuffer {
   _message(data) {
     if (!(data instanceof ArrayBuffer)) {
       if ("state" in data) this._stateIs(data);
-      else if (Number.isFinite(data.written))
-        this.latency.written(data.frame, data.written, Date.now() + this.socket.ahead);
+      else if (Number.isFinite(data.written)) this._written(data);
       return;
     }
     const bytes = new Uint8Array(data);
@@ -157,6 +138,12 @@ export class LiveBuffer {
     } catch (error) {
       this._refuse(error);
     }
+  }
+
+  /** Say when a packet was written, when it came, and by what this clock is behind the server's. */
+  _written({ frame, written }) {
+    const { ahead } = this.socket;
+    this.stream.say({ written: { frame, written, came: Date.now() + ahead, ahead, joined: this.joined + ahead } });
   }
 
   _stateIs({ state, detail }) {
@@ -190,6 +177,7 @@ export class LiveBuffer {
     this.trouble = null;
     this.socket.sound();
     this._timed();
+    this.feed();
     if (this.waiting > this.most && this.queue.length > 1) {
       this.asleep = true;
       this.socket.stop();
@@ -210,7 +198,7 @@ export class LiveBuffer {
       return;
     }
     this.socket.stop();
-    this.player._stop(new PacketError(sentence(error.message)));
+    this.stream.fail(new PacketError(sentence(error.message)));
   }
 
   _timed() {
@@ -226,7 +214,7 @@ export class LiveBuffer {
     if (name === "ended") return "The stream has ended.";
     if (name !== "live") return sentence(detail || "no frame is encoded yet.");
     const silence = this.at ? performance.now() - this.at : 0;
-    if (!this.player.playing || silence < Math.max(settings.quiet, 3 * Math.max(0, ...this.gaps))) return "";
+    if (!this.stream.playing || silence < Math.max(settings.quiet, 3 * Math.max(0, ...this.gaps))) return "";
     return `No new frame came for ${Math.floor(silence / 1000)} s.`;
   }
 
@@ -234,8 +222,7 @@ export class LiveBuffer {
     const text = this._sentence();
     if (text === this.said) return;
     this.said = text;
-    this.player.problem = text || null;
-    this.player.dispatchEvent(new CustomEvent("problem", { detail: text }));
+    this.stream.say({ problem: text, ended: false });
   }
 }
 

@@ -1,19 +1,21 @@
-// Plays a stream on a canvas: loads, decodes, keeps time, and draws from where the viewer looks.
+// Plays a stream on a canvas: keeps time, asks for frames, and draws from where the viewer looks. Loading and decoding
+// are done elsewhere (see stream.js); nothing of a packet comes here.
 
-import { PacketBuffer } from "./buffer.js";
 import { cameraOf, pivotOf, viewsOf } from "./camera.js";
-import { KIND } from "./container.js";
-import { Snapshots, decodePacket } from "./decode.js";
-import { PacketError } from "./errors.js";
 import { Renderer } from "./renderer.js";
 import { regionOf } from "./region.js";
-import { openSource } from "./source.js";
+import { StreamLink } from "./stream-link.js";
 
-/** Decoding may take so many milliseconds before the page gets its turn; what lies before the target is not drawn. */
-const BUDGET = 80;
+/** Milliseconds of a turn in which what came is handed to the graphics. */
+const UPLOAD = 4;
+/** Seconds of playing that may be left out at once when frames come late. */
+const LATE = 0.25;
 
 /**
- * `options.renderer` takes the place of the player's own; it has `update(state)`, `draw(camera)` and `dispose()`.
+ * `options.renderer` takes the place of the player's own; it has `take(update, deadline)` (see Renderer),
+ * `draw(camera, options)` and `dispose()`. `options.worker` false decodes on the page's thread.
+ *
+ * `state` is `{ frame, number, meta }` of the frame that is shown; `number` counts Gaussians.
  *
  * Events: `opened` (what there is to load is known), `ready` (the first picture can be drawn), `drawn` (it is), `frame`,
  * `state` (playing, waiting, paused, ended), `problem` (detail: a sentence), `view`.
@@ -23,54 +25,54 @@ export class Player extends EventTarget {
     super();
     this.canvas = canvas;
     this.options = options;
-    const drawing = { onChange: () => this.invalidate(), useWorker: options.worker !== false };
-    this.renderer = options.renderer ?? new Renderer(canvas, drawing);
+    const onChange = () => this.invalidate();
+    const useWorker = options.worker !== false;
+    const onLost = () => this.link.post("whole");
+    this.renderer = options.renderer ?? new Renderer(canvas, { onChange, onLost, useWorker });
     this.loop = options.loop ?? true;
     this.speed = options.speed ?? 1;
     this.playing = false;
-    this.state = null;
     this.view = this.pivot = this.region = null;
     this.views = [];
-    this.buffer = this.problem = null;
-    this.snapshots = new Snapshots();
     this.statistics = { drawn: 0, decode: 0, bytes: 0, uploaded: 0 };
-    this._target = null;
-    this._clock = this._taken = 0;
+    /** What draws in the place of the canvas, and calls `turn` for every picture: a headset. */
+    this.driver = null;
+    this._number = this._clock = this._taken = 0;
     this._then = null;
-    this._dirty = this._closed = this._behind = this.drew = false;
+    this._dirty = this._closed = this.drew = false;
+    this._reset();
+    this.link = new StreamLink((message) => this._hear(message), { allowed: useWorker, early: options.early });
     this._tick = (now) => this._turn(now);
     requestAnimationFrame(this._tick);
   }
 
-  /** Open a stream; resolves when its first frame is decoded. Rejects with an Error of one sentence. */
-  async open(url) {
+  /** Open a stream; resolves when its first frame is there. Rejects with an Error of one sentence. */
+  open(url) {
+    const { href } = new URL(url, document.baseURI);
+    const { early } = this.options;
+    const told = this._number === 0 && early?.worker && !early.failed;
+    const heard = this._unheard;
     this.close();
-    this._abort = new AbortController();
-    this.source = await openSource(url, this._abort.signal);
-    this._say("opened");
-    await this._start(this.source.segments, null);
+    this._number += told && early.url !== href ? 2 : 1;
+    if (told && early.url === href) {
+      // It was asked for before this module was there.
+      this.link.sent?.push(["open", 1, href]);
+      for (const message of heard) this._hear(message);
+    } else {
+      this.link.post("open", this._number, href);
+    }
+    return this._opening();
   }
 
   /** Go on with another rendition of the recording, from the key packet before the frame that is shown. */
-  async choose(index) {
-    const chosen = this.source.renditions[index];
-    const frame = this.frame;
-    this.buffer.dispose();
+  choose(index) {
+    const { frame } = this;
+    this._came = [];
     this.state = null;
-    await this._start(chosen.segments, frame);
-  }
-
-  _start(segments, frame) {
-    this.snapshots.clear();
-    // A part of a packet may be enough for a first picture.
-    const early = (walker) => this.state || import("./early.js").then(({ look }) => look(this, walker), () => {});
-    this.buffer = this.source.follow?.(this) ?? new PacketBuffer(segments, () => this._news(), early);
-    this.buffer.fps = this.source.fps ?? 30;
-    this._target = this.buffer.live ? null : (frame ?? this.buffer.first ?? 0);
-    this.buffer.want(this._target);
-    return new Promise((resolve, reject) => {
-      this._opened = { resolve, reject };
-    });
+    this._target = this._asked = frame;
+    this._number += 1;
+    this.link.post("choose", this._number, index, frame);
+    return this._opening();
   }
 
   get frame() {
@@ -93,25 +95,26 @@ export class Player extends EventTarget {
   play() {
     if (this.playing) return;
     if (this.frame !== null && this.buffer.last !== null && this.frame >= this.last) this.seek(this.first);
-    if (this.problem) this.buffer?.retry?.();
+    if (this.problem) this.link.post("retry");
     this.problem = null;
     this.playing = true;
     this._clock = 0;
+    this.link.post("play", true);
     this._say("state");
   }
 
   pause() {
     this.playing = false;
+    this.link.post("play", false);
     this._say("state");
   }
 
   /** Show a frame as soon as it is there. A live stream only shows its newest. */
   seek(frame) {
-    const wanted = Math.max(this.first, Math.min(Math.round(frame), this.last));
-    this._target = wanted;
+    if (this.buffer?.live) return;
+    this._ask(Math.max(this.first, Math.min(Math.round(frame), this.last)));
+    this._seeking = true;
     this._clock = 0;
-    this.buffer?.want(wanted, this.frame);
-    this.invalidate();
   }
 
   /** Look through one of the recording's cameras. */
@@ -141,163 +144,208 @@ export class Player extends EventTarget {
     this._dirty = true;
   }
 
+  /** A copy of the Gaussians of the frame decoded last: `{ frame, number, widths, means, quats, ... }`, or null. */
+  scene() {
+    return new Promise((resolve) => {
+      this._scenes.push(resolve);
+      this.link.post("scene");
+    });
+  }
+
   /** Draw now. `exact` finds the depth order first; else it may be that of before, and then `patient` draws nothing. */
   draw(options = {}) {
     if (!this.state || !this.view) return false;
-    const drew = this.renderer.draw(cameraOf(this.view, this.canvas.width, this.canvas.height), options);
-    this.statistics.uploaded += this.renderer.uploaded;
-    if (drew === false) return false;
+    if (this.renderer.draw(cameraOf(this.view, this.canvas.width, this.canvas.height), options) === false) return false;
+    this.shown();
+    return true;
+  }
+
+  /** A picture of the state was drawn. */
+  shown() {
     this.statistics.drawn += 1;
     if (!this.drew) {
       this.drew = true;
       this._say("drawn");
     }
-    this.buffer?.shown?.(this.frame);
-    return true;
+    this.latency?.shown(this.frame, Date.now());
   }
 
   close() {
-    this._abort?.abort(new DOMException("the player is closed", "AbortError"));
-    this.buffer?.dispose();
-    this.buffer = this.state = this.view = this.problem = this._target = null;
-    this.drew = false;
+    if (this.buffer || this._opened) this.link.post("close");
+    this._opened?.reject(new DOMException("the player is closed", "AbortError"));
+    this._reset();
   }
 
   dispose() {
     this._closed = true;
     this.close();
+    this.link.dispose();
     this.renderer.dispose();
+  }
+
+  /** What is done for every picture but drawing it. */
+  turn(now) {
+    const seconds = this._then === null ? 0 : Math.min((now - this._then) / 1000, 0.25);
+    this._then = now;
+    this.options.beforeFrame?.(seconds);
+    this._take(performance.now() + UPLOAD);
+    if (!this.buffer?.live) this._advance(seconds);
   }
 
   _turn(now) {
     if (this._closed) return;
     requestAnimationFrame(this._tick);
-    const seconds = this._then === null ? 0 : Math.min((now - this._then) / 1000, 0.25);
-    this._then = now;
-    this.options.beforeFrame?.(seconds);
-    if (this.buffer?.live) this.buffer.feed();
-    else if (this.buffer) this._advance(seconds);
-    if (this._dirty && this.state && !this._behind) {
+    if (this.driver) return;
+    this.turn(now);
+    if (!this._dirty) return;
+    if (this.state) {
       this._dirty = false;
-      // It waits once: packets may come faster than orders.
+      // It waits once: frames may come faster than orders.
       this._taken = this.draw({ patient: this._taken > 1 }) ? 0 : -Infinity;
+    } else if (this._glimpse) {
+      const { view, number } = this._glimpse;
+      this._dirty = false;
+      if (this.renderer.draw(cameraOf(view, this.canvas.width, this.canvas.height)) !== false)
+        this.statistics.early = number;
     }
   }
 
-  /** Let the clock run and decode up to the frame it says. */
-  _advance(seconds) {
-    if (this._target === null && this.playing && this.state) {
-      this._clock += seconds * this.fps * this.speed;
-      if (this._clock >= 1) {
-        const step = Math.floor(this._clock);
-        this._clock -= step;
-        this._step(step);
+  _reset() {
+    this.source = this.buffer = this.state = this.view = this.problem = this.latency = null;
+    this._target = this._asked = this._opened = this._glimpse = this._meta = null;
+    this._came = [];
+    this._unheard = [];
+    this._scenes = [];
+    this._seeking = this.drew = false;
+  }
+
+  _opening() {
+    this._opened?.reject(new DOMException("another stream is opened", "AbortError"));
+    return new Promise((resolve, reject) => {
+      this._opened = { resolve, reject };
+    });
+  }
+
+  /** A message of the stream. */
+  _hear(message) {
+    if (this._number === 0) this._unheard.push(message);
+    if (this._closed || (message.number ?? this._number) !== this._number) return;
+    const { loaded, opened, frame, early, written } = message;
+    if (loaded) this.buffer = { ...this.buffer, ...loaded };
+    if (opened) this._begin(opened);
+    if (frame || early) this._came.push(frame ?? early);
+    if (frame) this.buffer = { ...this.buffer, ...frame.loaded };
+    if ("problem" in message) this._stop(message);
+    if ("scene" in message) this._scenes.shift()?.(message.scene);
+    if (written) this.latency?.written(written);
+  }
+
+  async _begin(opened) {
+    this.source = opened;
+    if (opened.live) {
+      this.playing = true;
+      this.link.post("feed");
+    }
+    this._say("opened");
+    if (!opened.live) return;
+    const { Latency } = await import("./latency.js");
+    if (this.source === opened) this.latency = new Latency();
+  }
+
+  /** Hand what came to the graphics, until the deadline. */
+  _take(deadline) {
+    while (this._came.length) {
+      const [update] = this._came;
+      try {
+        if (!this.renderer.take(update, deadline)) return;
+      } catch (error) {
+        this._came = [];
+        this._stop({ problem: error.message, kind: error.name, ended: true });
+        return;
       }
+      this._came.shift();
+      this.statistics.uploaded += this.renderer.uploaded ?? 0;
+      this._meta = update.meta ?? this._meta;
+      if (update.loaded) this._frame(update);
+      else this._early(update);
+      if (performance.now() >= deadline) return;
     }
-    if (this._target !== null) this._decodeTo(this._target);
   }
 
-  _step(step) {
-    const next = this.state.frame + step;
-    if (this.buffer.last === null || next <= this.buffer.last) {
-      this._target = next;
-    } else if (this.state.frame < this.buffer.last) {
-      this._target = this.buffer.last;
-    } else if (this.loop && this.buffer.last > this.first) {
-      this._target = this.first;
-    } else {
-      this.playing = false;
-      this._say("state");
-    }
-    if (this._target !== null) this.buffer.want(this._target, this.frame);
-  }
-
-  _decodeTo(frame) {
-    const started = performance.now();
-    this._behind = false;
-    let step = null;
-    try {
-      while (this.state === null || this.state.frame !== frame) {
-        step = this.buffer.towards(frame, this.frame);
-        if (!step) return this._missing(frame);
-        this._take(step);
-        if ((this._behind = performance.now() - started > BUDGET && this.state.frame !== frame)) return undefined;
-      }
-    } catch (error) {
-      // What is damaged was not applied. A join may be done without.
-      if (error instanceof PacketError && this.buffer.spoil(frame, error, Boolean(step?.join))) return undefined;
-      return this._stop(error);
-    }
-    this._target = null;
+  _frame({ frame, gaussians, packets, key, statistics }) {
+    this.state = { frame, number: gaussians, meta: this._meta };
+    Object.assign(this.statistics, statistics, { key });
+    // After a jump, of more than one packet or to a key packet, the order of before is far from right.
+    this._taken += packets + key;
+    if (this.view === null) this._ready();
+    if (this._target === frame || this._asked === frame) this._target = null;
+    if (this._target === null) this._seeking = false;
+    if (this.buffer.live) this.link.post("feed");
+    this._opened?.resolve();
+    this._opened = null;
     this.invalidate();
     this._say("frame");
-    return undefined;
   }
 
-  /** Decode one packet, or begin where a join says. */
-  _take({ packet, key, join, decode }) {
-    const started = performance.now();
-    if (join) {
-      this.state = decode(this._keyState(key), join);
-    } else if (packet.header.kind === KIND.key) {
-      this.state = this._keyState(packet);
-    } else {
-      this.state = decodePacket(this.state, packet.data, packet.offset);
-    }
-    this.renderer.update(this.state);
-    // After a jump, of more than one packet or to a key packet, the order of before is far from right.
-    this._taken += this.state.change.kind === "key" ? 2 : 1;
-    this.statistics.decode = performance.now() - started;
-    this.statistics.bytes = (packet?.data ?? join).length;
-    this.statistics.key = this.state.change.kind === "key";
-    if (this.view === null) this._ready();
-    if (this._opened) {
-      this._opened.resolve();
-      this._opened = null;
-    }
+  _early({ gaussians }) {
+    const view = this._firstView();
+    if (this.state || !view) return;
+    this._glimpse = { view, number: gaussians };
+    this.invalidate();
   }
 
-  /** The state after a key packet, decoded once for several uses. */
-  _keyState(packet) {
-    const known = this.snapshots.get(packet);
-    if (known) return known;
-    const state = decodePacket(null, packet.data, packet.offset);
-    this.snapshots.keep(packet, state);
-    return state;
+  /** Let the clock run and ask for the frame that it says. */
+  _advance(seconds) {
+    if (!this.playing || !this.state || this._seeking) return;
+    const pace = this.fps * this.speed;
+    this._clock = Math.min(this._clock + seconds * pace, Math.max(1, LATE * pace));
+    if (this._target !== null || this._clock < 1) return;
+    const step = Math.floor(this._clock);
+    this._clock -= step;
+    const next = this.frame + step;
+    const { last } = this.buffer;
+    if (last === null || next <= last) this._ask(next);
+    else if (this.frame < last) this._ask(last);
+    else if (this.loop && last > this.first) this._ask(this.first);
+    else this.pause();
+  }
+
+  _ask(frame) {
+    this._target = this._asked = frame;
+    this.link.post("to", frame);
+  }
+
+  _firstView() {
+    this.views = viewsOf(this._meta);
+    return this.views.find(({ id }) => id === this.options.camera) ?? this.views[0];
   }
 
   _ready() {
-    this.views = viewsOf(this.state.meta);
-    if (!this.views.length) throw new Error("The stream names no camera to look from.");
-    const wanted = this.views.findIndex((view) => view.id === this.options.camera);
-    this.look(Math.max(wanted, 0));
-    this.buffer.fps = this.fps;
+    const view = this._firstView();
+    if (!view) {
+      this._stop({ problem: "The stream names no camera to look from.", kind: "Error", ended: true });
+      this.state = null;
+      return;
+    }
+    this.look(this.views.indexOf(view));
     this._say("ready");
   }
 
-  /** A frame is not loaded: wait for it, or, when it will never come, say why and go on with what is sound. */
-  _missing(frame) {
-    const failure = this.buffer.failure(frame, this.frame);
-    if (failure) this._stop(failure);
-    else this.buffer.want(frame, this.frame);
-  }
-
-  /** Say what is wrong. A damaged segment is left out where another one follows; anything else ends the playing. */
-  _stop(error) {
-    const next = error instanceof PacketError && this.playing ? this.buffer.nextSegment(this._target) : null;
-    this._target = next;
-    this.playing &&= next !== null;
-    this.problem = error.message;
-    this._opened?.reject(error);
-    this._opened = null;
-    this.dispatchEvent(new CustomEvent("problem", { detail: error.message }));
+  /** Something is wrong. What cannot be gone on with ends the playing. */
+  _stop({ problem, kind, ended, next = null }) {
+    this.problem = problem || null;
+    if (next !== null) this._target = next;
+    if (ended) {
+      this.playing = false;
+      this._target = null;
+      this._seeking = false;
+    }
+    if (problem && kind) {
+      this._opened?.reject(Object.assign(new Error(problem), { name: kind }));
+      this._opened = null;
+    }
+    this.dispatchEvent(new CustomEvent("problem", { detail: problem }));
     this._say("state");
-  }
-
-  _news() {
-    // The first frame of a file without an index is known only now.
-    const first = this.buffer?.first;
-    if (this.state === null && first !== null && this._target < first) this._target = first;
   }
 
   _say(name) {

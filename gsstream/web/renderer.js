@@ -1,6 +1,6 @@
 // Draws a scene with WebGL2 from float32 textures, in the depth order that a worker finds.
 
-import { ResidentScene } from "./resident.js";
+import { SceneTextures } from "./scene-textures.js";
 import { COPY_FRAGMENT_SHADER, COPY_VERTEX_SHADER } from "./shaders.js";
 import { SortQueue } from "./sort-queue.js";
 import { Projection, Quads, link } from "./splats.js";
@@ -12,10 +12,10 @@ import { Projection, Quads, link } from "./splats.js";
  */
 export class Renderer {
   /**
-   * Draw on `canvas`. `onChange` is called when a new order has come and a picture should be drawn. Throws an Error in
-   * plain words when the browser offers no WebGL2.
+   * Draw on `canvas`. `onChange` is called when a new order has come and a picture should be drawn, `onLost` when the
+   * graphics forgot the scene. Throws an Error in plain words when the browser offers no WebGL2.
    */
-  constructor(canvas, { onChange = () => {}, useWorker = true } = {}) {
+  constructor(canvas, { onChange = () => {}, onLost = () => {}, useWorker = true } = {}) {
     const gl = canvas.getContext("webgl2", {
       antialias: false,
       depth: false,
@@ -28,29 +28,38 @@ export class Renderer {
     this.background = [0, 0, 0];
     this.marks = false;
     this.uploaded = 0;
-    this.scene = new ResidentScene(gl);
+    this.textures = new SceneTextures(gl);
     this.sorter = new SortQueue(onChange, useWorker);
-    this.state = null;
-    this._moved = new Set();
+    /** The slot of each row, null while they are the same; the frame that is there. */
+    this.list = this.frame = null;
     this._setUp();
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
     canvas.addEventListener("webglcontextrestored", () => {
+      this.textures = new SceneTextures(gl);
+      this.frame = null;
       this._setUp();
-      this.scene.restore(this.state);
-      onChange();
+      onLost();
     });
   }
 
-  /** Take note of what the packet just decoded into `state` changed. Call it once for every packet. */
-  update(state) {
-    this.state = state;
-    this.background = state.meta.background;
-    const { anew, moved } = this.scene.update(state);
-    if (anew) {
-      this.sorter.reset(this.scene.capacity);
-      this._moved.clear();
+  /**
+   * Take what Packer packed, `{ frame, background, ... }`, until `deadline` (of performance.now). Returns whether all of
+   * it is there; call it again with the same until it is. Of a lost context nothing is there, and nothing is waited for.
+   */
+  take(update, deadline) {
+    this.uploaded = 0;
+    // After a loss only all of a scene is of use.
+    const usable = this.textures.geometry || update.textures.geometry.all;
+    if (usable && !this.gl.isContextLost()) {
+      if (!this.textures.take(update, deadline)) return false;
+      this.uploaded = this.textures.uploaded;
+      this.frame = update.frame;
     }
-    for (const slot of moved) this._moved.add(slot);
+    const { anew, slots, positions } = update.places;
+    if (anew || slots.length) this.sorter.update(slots, positions);
+    if (update.list !== undefined) this.list = update.list;
+    this.background = update.background;
+    return true;
   }
 
   /**
@@ -59,21 +68,47 @@ export class Renderer {
    * whether it drew.
    */
   draw(camera, { exact = false, patient = false } = {}) {
-    if (!this.state || this.gl.isContextLost()) return false;
-    const { sorter, scene } = this;
-    this._sendPositions();
-    const axis = Array.from(camera.viewmat.slice(8, 12));
-    if (exact) sorter.sortNow(axis, camera.near, scene.slots.slotOf);
-    else sorter.request(axis, camera.near);
-    // While the worker sorts.
-    this.projection.fit(scene.textures);
-    this.uploaded = scene.textures.flush();
-    if (!exact && sorter.busy && (patient || !sorter.order.length)) return false;
-    this._fitTarget();
-    this.projection.update(this.scene.textures, camera, this.canvas, this.marks ? this.state.frame : -1);
-    this._drawSplats();
-    this._copyToCanvas();
+    if (!this.prepare(camera, exact)) return false;
+    if (!exact && this.sorter.busy && (patient || !this.sorter.order.length)) return false;
+    const { width, height } = this.canvas;
+    this.paint(camera, { framebuffer: null, x: 0, y: 0, width, height });
     return true;
+  }
+
+  /** Ask for the depth order of a view, or find it if `exact`. Returns whether there is anything to draw. */
+  prepare({ viewmat, near }, exact = false) {
+    if (this.frame === null || this.gl.isContextLost()) return false;
+    const axis = Array.from(viewmat.slice(8, 12));
+    if (exact) this.sorter.sortNow(axis, near, this.list);
+    else this.sorter.request(axis, near);
+    // While the worker sorts.
+    this.projection.fit(this.textures);
+    return true;
+  }
+
+  /** Draw a view into a window of a framebuffer, in the order that is there; `shown`: the share that is left of a fade. */
+  paint(camera, { framebuffer, x, y, width, height }, shown = 1) {
+    const { gl } = this;
+    this._fitTarget(width, height);
+    this.projection.update(this.textures, camera, { width, height }, this.marks ? this.frame : -1);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target ? this.target.buffer : framebuffer);
+    gl.viewport(this.target ? 0 : x, this.target ? 0 : y, width, height);
+    gl.enable(gl.SCISSOR_TEST);
+    gl.scissor(this.target ? 0 : x, this.target ? 0 : y, width, height);
+    gl.clearColor(...this.background, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.disable(gl.SCISSOR_TEST);
+    this.quads.draw(this.sorter.order, this.projection, { width, height });
+    if (!this.target) return;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gl.viewport(x, y, width, height);
+    gl.useProgram(this.copy.handle);
+    gl.bindTexture(gl.TEXTURE_2D, this.target.texture);
+    gl.uniform1i(this.copy.at("picture"), 0);
+    gl.uniform2i(this.copy.at("corner"), x, y);
+    gl.uniform1f(this.copy.at("shown"), shown);
+    gl.bindVertexArray(this.plain);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
   dispose() {
@@ -98,57 +133,22 @@ export class Renderer {
     gl.disable(gl.DITHER);
   }
 
-  _sendPositions() {
-    if (!this._moved.size) return;
-    const slots = Uint32Array.from(this._moved);
-    const positions = new Float32Array(3 * slots.length);
-    const { rowOf } = this.scene.slots;
-    const { means } = this.state.scene;
-    for (let i = 0; i < positions.length; i += 1) {
-      const row = rowOf[slots[Math.floor(i / 3)]];
-      positions[i] = row >= 0 ? means[3 * row + (i % 3)] : NaN;
-    }
-    this._moved.clear();
-    this.sorter.update(slots, positions);
-  }
-
-  _fitTarget() {
-    const { gl, canvas } = this;
-    if (!this.deep || (this.target && this.target.width === canvas.width && this.target.height === canvas.height))
-      return;
+  _fitTarget(width, height) {
+    const { gl } = this;
+    if (!this.deep || (this.target?.width === width && this.target.height === height)) return;
     if (this.target) {
       gl.deleteTexture(this.target.texture);
       gl.deleteFramebuffer(this.target.buffer);
     }
     const texture = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, this.format, canvas.width, canvas.height);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, this.format, width, height);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
     const buffer = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
-    this.target = { texture, buffer, width: canvas.width, height: canvas.height };
-  }
-
-  _drawSplats() {
-    const { gl, canvas } = this;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target ? this.target.buffer : null);
-    gl.viewport(0, 0, canvas.width, canvas.height);
-    gl.clearColor(...this.background, 1);
-    gl.clear(gl.COLOR_BUFFER_BIT);
-    this.quads.draw(this.sorter.order, this.projection, canvas);
-  }
-
-  _copyToCanvas() {
-    if (!this.target) return;
-    const { gl } = this;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.useProgram(this.copy.handle);
-    gl.bindTexture(gl.TEXTURE_2D, this.target.texture);
-    gl.uniform1i(this.copy.at("picture"), 0);
-    gl.bindVertexArray(this.plain);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    this.target = { texture, buffer, width, height };
   }
 }
 

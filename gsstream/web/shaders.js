@@ -1,12 +1,6 @@
 // GLSL of the renderer. The conventions are those of the streams: 0.3 px blur, alpha cut 1/255, alpha clamp 0.999.
 
-/** Texels of one Gaussian in the texture of centres, rotations and scales. */
-export const GEOMETRY_TEXELS = 3;
-
-/** Texels of one Gaussian in the texture of colour coefficients of a degree: coefficients are packed without gaps. */
-export function colourTexels(degree) {
-  return Math.ceil((3 * (degree + 1) ** 2) / 4);
-}
+import { GEOMETRY_TEXELS, colourTexels } from "./texels.js";
 
 const CONSTANTS = [
   "0.28209479177387814",
@@ -181,8 +175,10 @@ void main() {
 export const COPY_FRAGMENT_SHADER = `#version 300 es
 precision highp float;
 uniform sampler2D picture;
+uniform ivec2 corner;  // of the window that is filled, in pixels of what it lies in
+uniform float shown;   // share of the picture that is left of a fade into black
 out vec4 result;
 
 void main() {
-  result = vec4(clamp(texelFetch(picture, ivec2(gl_FragCoord.xy), 0).rgb, 0.0, 1.0), 1.0);
+  result = vec4(clamp(texelFetch(picture, ivec2(gl_FragCoord.xy) - corner, 0).rgb, 0.0, 1.0) * shown, 1.0);
 }`;

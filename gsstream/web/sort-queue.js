@@ -1,6 +1,7 @@
 // The depth order of what is drawn, from a worker where there is one. At most one request is under way.
 
 import { DepthSorter } from "./sorting.js";
+import { startWorker } from "./workers.js";
 
 /** Hands positions to the sorter and keeps its last answer in `order`. */
 export class SortQueue {
@@ -12,7 +13,7 @@ export class SortQueue {
     this.busy = false;
     this.waiting = null;
     this.asked = null;
-    this.worker = useWorker ? startWorker() : null;
+    this.worker = useWorker ? startWorker("sort-worker.js") : null;
     this.local = new DepthSorter();
     if (this.worker) {
       this.worker.onmessage = ({ data }) => this._received(data);
@@ -20,16 +21,12 @@ export class SortQueue {
     }
   }
 
-  reset(capacity) {
-    this.asked = null;
-    this.local.reset(capacity);
-    this.worker?.postMessage({ reset: capacity });
-  }
-
+  /** Positions of `slots`, or of all (slots null), which replace those of before. */
   update(slots, positions) {
     this.asked = null;
-    this.local.update(slots, positions);
-    this.worker?.postMessage({ slots, positions }, [slots.buffer, positions.buffer]);
+    this.worker?.postMessage({ slots, positions });
+    if (slots) this.local.update(slots, positions);
+    else this.local.reset(positions.length / 3, positions);
   }
 
   /** Ask for the order of a view, unless it is known; of several requests that wait only the last is carried out. */
@@ -78,13 +75,5 @@ export class SortQueue {
     this.busy = false;
     this.asked = null;
     this.onOrder();
-  }
-}
-
-function startWorker() {
-  try {
-    return new Worker(new URL("./sort-worker.js", import.meta.url), { type: "module" });
-  } catch {
-    return null;
   }
 }

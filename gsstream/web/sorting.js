@@ -4,13 +4,12 @@
 export class DepthSorter {
   constructor() {
     this.positions = new Float32Array(0);
-    this._reserve(0);
+    this.keys = new Uint32Array(0);
   }
 
-  /** Forget all positions and make room for `capacity` slots; a slot without a position is never drawn. */
-  reset(capacity) {
-    this.positions = new Float32Array(3 * capacity).fill(NaN);
-    this._reserve(capacity);
+  /** Forget all positions and make room for `capacity` slots, or take those given; one of NaN is never drawn. */
+  reset(capacity, positions = new Float32Array(3 * capacity).fill(NaN)) {
+    this.positions = positions;
   }
 
   /** Set the positions [k, 3] of `slots` [k]; NaN takes a slot out. */
@@ -26,6 +25,7 @@ export class DepthSorter {
    * place in `list` where one is given: copies of a Gaussian lie at the very same place.
    */
   sort([x, y, z, offset], near, list = null) {
+    if (3 * this.keys.length < this.positions.length) this._reserve(this.positions.length / 3);
     const { positions, keys, slots } = this;
     const depth = this.depth;
     const bits = new Uint32Array(depth.buffer);

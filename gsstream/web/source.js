@@ -11,10 +11,10 @@ import { PacketWalker } from "./walker.js";
  * file, or the whole file. `last` and `frames` are null where only playing tells. Where a segment can be joined in its
  * middle, each piece is an entry of its own: those behind the first have `join`, the state they begin with, and `key`,
  * the key packet that it refers to; `all` says where their file ends. Of a live stream
- * there are no segments but `follow(player)`, which returns its buffer. Throws SourceError or PacketError.
+ * there are no segments but `follow(stream)`, which returns its buffer. Throws SourceError or PacketError.
  */
 export async function openSource(url, signal) {
-  const address = new URL(url, globalThis.document?.baseURI);
+  const address = new URL(url);
   if (/^wss?:$/.test(address.protocol)) return liveSource(address);
   if (address.pathname.endsWith("/")) address.pathname += "stream.json";
   if (address.pathname.endsWith(".json")) return openManifest(address.href, signal);
@@ -52,7 +52,7 @@ async function openManifest(url, signal) {
 async function liveSource(address) {
   if (/^https?:$/.test(address.protocol)) address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
   const { LiveBuffer } = await import("./live.js");
-  const follow = (player) => new LiveBuffer(address.href, player);
+  const follow = (stream) => new LiveBuffer(address.href, stream);
   return { live: true, follow, segments: [], frames: null, fps: null, renditions: [] };
 }
 

@@ -27,7 +27,7 @@ export class Projection {
     const { gl } = this;
     const { geometry, colours } = scene;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.buffer);
-    gl.viewport(0, 0, 2 ** this.shift, Math.ceil(scene.slots.used / 2 ** this.shift));
+    gl.viewport(0, 0, 2 ** this.shift, Math.ceil(scene.used / 2 ** this.shift));
     const { program } = this;
     gl.useProgram(program.handle);
     const m = camera.viewmat;

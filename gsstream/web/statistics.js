@@ -37,8 +37,8 @@ export class Statistics {
       buffer.live ? `live, frame ${player.frame}` : `frame ${player.frame} of ${player.first} to ${player.last}`,
       `${player.state.number.toLocaleString("en")} Gaussians`,
       buffer.live
-        ? `${loaded}, ${buffer.latency.text()}`
-        : `${loaded}, ${buffer.secondsAfter(player.frame).toFixed(1)} s ahead`,
+        ? `${loaded}, ${player.latency?.text() ?? ""}`
+        : `${loaded}, ${buffer.seconds.toFixed(1)} s ahead`,
       `sorting ${player.renderer.sorter.milliseconds.toFixed(1)} ms`,
     ];
     // Of frames that were decoded since the statistics are shown; before there is one, there is nothing to say.
@@ -46,7 +46,8 @@ export class Statistics {
       const bytes = mean(this.frames);
       const rate = (bytes * 8 * player.fps) / 1e6;
       lines.push(`${(bytes / 1000).toFixed(1)} KB a frame between key packets, ${rate.toFixed(2)} Mbit/s`);
-      lines.push(`decoding ${mean(this.decoding).toFixed(1)} ms`);
+      const where = player.link.worker ? "in a worker" : "on the page's thread";
+      lines.push(`decoding ${mean(this.decoding).toFixed(1)} ms ${where}`);
     }
     if (this.drawn) {
       const uploaded = (this.uploaded / 1000).toFixed(0);

@@ -31,6 +31,8 @@ needs_browser = pytest.mark.skipif(
 PLAYER = "document.querySelector('gsstream-player')?.player"
 ROOT = "document.querySelector('gsstream-player')?.shadowRoot"
 MESSAGE = f"({ROOT}?.querySelector('.message')?.textContent ?? '')"
+#: A step that takes workers away from the pages that are opened next: the stream is decoded on the page's thread.
+WITHOUT_WORKERS = ["send", "Page.addScriptToEvaluateOnNewDocument", {"source": "delete globalThis.Worker"}]
 READY = ["until", f"{PLAYER}?.state && {PLAYER}._target === null"]
 
 
@@ -38,13 +40,18 @@ class Handler(SimpleHTTPRequestHandler):
     """A static server.
 
     ``faults``: ranges (false: always 200), cut_after (bytes), status, gone_after (files), held_after (bytes; the others
-    come once the page has asked for /mended, which ends all faults).
+    come once the page has asked for /mended, which ends all faults), cors (pages of other origins may read).
     """
 
     extensions_map = SimpleHTTPRequestHandler.extensions_map | {".js": "text/javascript"}
 
     def log_message(self, *_: object) -> None:
         """Say nothing."""
+
+    def end_headers(self) -> None:
+        if self.server.faults.get("cors"):  # type: ignore[attr-defined]
+            self.send_header("Access-Control-Allow-Origin", "*")
+        super().end_headers()
 
     def do_GET(self) -> None:
         faults = self.server.faults  # type: ignore[attr-defined]

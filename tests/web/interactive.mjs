@@ -13,6 +13,7 @@ const browser = await Browser.start(chromium, { width: Number(width), height: Nu
 const actions = {
   go: (url) => browser.go(url),
   until: (expression, seconds) => browser.until(expression, seconds),
+  send: (method, params) => browser.send(method, params),
   evaluate: (expression) => browser.evaluate(expression),
   screenshot: async (path) => writeFileSync(path, await browser.screenshot()),
 };

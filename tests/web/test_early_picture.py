@@ -84,7 +84,7 @@ PICTURE = f"""(async () => {{
   const {{ cameraOf, viewsOf }} = await import('/camera.js');
   const {{ canvas, renderer }} = {PLAYER};
   Object.assign(canvas, {{ width: 32, height: 24 }});
-  renderer.draw(cameraOf(viewsOf(renderer.state.meta)[0], 32, 24), {{ exact: true }});
+  renderer.draw(cameraOf(viewsOf({PLAYER}._meta)[0], 32, 24), {{ exact: true }});
   let text = "";
   for (let y = 23; y >= 0; y -= 1) {{
     const bytes = new Uint8Array(4 * 32);
@@ -148,7 +148,7 @@ def test_a_byte_less_than_the_first_layer_draws_nothing(tmp_path):
     package(written(tmp_path, packet), tmp_path / "site")
     steps = [
         ["go", "URL/index.html"],
-        ["until", f"{PLAYER}?.buffer?.loading"],
+        ["until", f"{PLAYER}?.buffer"],
         ["pause", 1500],
         ["evaluate", f"[{EARLY} ?? null, {PLAYER}.state, {PLAYER}.statistics.drawn]"],
         ["evaluate", "fetch('mended')"],
@@ -173,7 +173,7 @@ def test_a_damaged_layer_does_no_harm(tmp_path, where):
     segment.write_bytes(data)
     wait = ["pause", 1500] if where == "first" else ["until", EARLY]
     steps = [
-        ["go", "URL/index.html"], ["until", f"{PLAYER}?.buffer?.loading"], wait,
+        ["go", "URL/index.html"], ["until", f"{PLAYER}?.buffer"], wait,
         ["evaluate", f"{EARLY} ?? null"], ["evaluate", "fetch('mended')"], ["until", f"{PLAYER}.problem"],
         ["evaluate", MESSAGE], ["evaluate", f"{PLAYER}.state"],
     ]  # fmt: skip

@@ -11,7 +11,7 @@ import time
 import zlib
 
 import pytest
-from browser_runs import MESSAGE, PLAYER, ROOT, needs_browser
+from browser_runs import MESSAGE, PLAYER, ROOT, WITHOUT_WORKERS, needs_browser
 from live_runs import HEADER, Growing, assert_playable, browsing, live_socket, packets_from, served
 from moving_scenes import moving_packets
 
@@ -24,6 +24,8 @@ from tests.flow.flow_runs import TINY, demo_copy
 pytestmark = needs_browser
 #: Seconds that an encoder may take on a machine that has much else to do.
 SLOW = 120
+#: The buffer of a page that decodes by itself.
+BUFFER = f"{PLAYER}.link.stream.buffer"
 #: Connect again at once: nobody waits for seconds here.
 HASTE = "import('./live-socket.js').then((m) => { m.settings.pauses = [100]; })"
 
@@ -32,6 +34,14 @@ HASTE = "import('./live-socket.js').then((m) => { m.settings.pauses = [100]; })"
 def page():
     with browsing() as page:
         yield page
+
+
+@pytest.fixture
+def by_itself(page):
+    """Pages that are opened meanwhile have no workers and decode on their own thread, where a test reaches it."""
+    name = page.send(*WITHOUT_WORKERS[1:])["identifier"]
+    yield
+    page.send("Page.removeScriptToEvaluateOnNewDocument", {"identifier": name})
 
 
 @pytest.fixture(scope="module")
@@ -58,16 +68,16 @@ def test_the_newest_frame_is_shown_as_it_comes(page, packets, tmp_path):
         stream.write(packets[:10], pause=0.05)
         shows(page, 9)
         assert page.evaluate(MESSAGE) == ""
-        latency = page.evaluate(f"{PLAYER}.buffer.latency.frames")
+        latency = page.evaluate(f"{PLAYER}.latency.frames")
         assert page.evaluate(f"{ROOT}.querySelector('.seek').hidden")
         # Whoever comes later begins at the last key packet, and sees the same state.
         stream.write(packets[10:25])
         page.go(server.url)
         shows(page, 24)
         assert page.evaluate(f"{PLAYER}.first") == 20
-        state = page.evaluate(f"Array.from({PLAYER}.state.scene.means)")
+        state = page.evaluate(f"{PLAYER}.scene().then(({{ means }}) => Array.from(means))")
         page.until(f"{PLAYER}.statistics.drawn > 0", 30)
-        assert page.evaluate(f"{PLAYER}.buffer.latency.frames") == [], "what was written before it came is not late"
+        assert page.evaluate(f"{PLAYER}.latency.frames") == [], "what was written before it came is not late"
         (tmp_path / "sound.gss").write_bytes((tmp_path / "s.gss").read_bytes())
         with Playback(tmp_path / "sound.gss") as playback:
             assert state == pytest.approx(playback.state_at(24).means.ravel().tolist(), abs=0)
@@ -97,23 +107,23 @@ def test_a_pause_is_caught_up_with_and_a_sleep_too(page, packets, tmp_path):
         assert page.evaluate(MESSAGE) == ""
 
 
-def test_a_page_that_is_not_shown_takes_no_more_than_its_share(page, packets, tmp_path):
+def test_a_page_that_is_not_shown_takes_no_more_than_its_share(page, by_itself, packets, tmp_path):
     """The limit is lowered: a hidden page gets no pictures to draw, and what waits for it must not grow."""
     stream = Growing(tmp_path / "s.gss")
     stream.write(packets[:2])
     with Server(tmp_path / "s.gss", live=True, port=0) as server:
         page.go(server.url)
         shows(page, 1)
-        page.evaluate(f"{{ const {{ buffer }} = {PLAYER}; buffer.most = 3000; buffer.feed = () => {{}}; }}")
+        page.evaluate(f"{{ const buffer = {BUFFER}; buffer.most = 3000; buffer.feed = () => {{}}; }}")
         stream.write(packets[2:19], pause=0.01)
-        page.until(f"{PLAYER}.buffer.asleep")
+        page.until(f"{BUFFER}.asleep")
         most = 3000 + max(len(p.data) for p in packets)
-        assert page.evaluate(f"{PLAYER}.buffer.queue.reduce((sum, p) => sum + p.data.length, 0)") <= most
-        page.evaluate(f"delete {PLAYER}.buffer.feed")
+        assert page.evaluate(f"{BUFFER}.queue.reduce((sum, p) => sum + p.data.length, 0)") <= most
+        page.evaluate(f"{{ delete {BUFFER}.feed; {BUFFER}.feed(); }}")
         shows(page, 18)
 
 
-def test_a_server_that_was_killed_is_told_and_taken_up_again(page, packets, tmp_path):
+def test_a_server_that_was_killed_is_told_and_taken_up_again(page, by_itself, packets, tmp_path):
     stream = Growing(tmp_path / "s.gss")
     stream.write(packets[:5])
     with served(tmp_path / "s.gss", "--live", "--port", 0) as (url, process):
@@ -161,7 +171,7 @@ def test_a_damaged_packet_stops_the_picture_until_the_next_key(page, packets, tm
         assert page.evaluate(MESSAGE) == ""
 
 
-def test_the_end_and_silence_are_told(page, packets, tmp_path):
+def test_the_end_and_silence_are_told(page, by_itself, packets, tmp_path):
     with Server(tmp_path / "s.gss", live=True, port=0) as server:
         with StreamWriter.open(tmp_path / "s.gss") as writer:
             for packet in packets[:3]:

@@ -13,8 +13,10 @@ from gsstream.player.playback import Playback
 from gsstream.serve.package import package
 
 pytestmark = needs_browser
+ATTRIBUTES = ["means", "quats", "scales", "opacities", "sh0", "shN"]
 #: The sum of all values of a state: one number that tells states apart.
-SUM = f"Object.values({PLAYER}.state.scene).reduce((sum, values) => values.reduce((s, v) => s + v, sum), 0)"
+SUM = f"""{PLAYER}.scene().then((scene) =>
+  {ATTRIBUTES}.reduce((sum, name) => scene[name].reduce((s, v) => s + v, sum), 0))"""
 
 
 @pytest.fixture(scope="module")

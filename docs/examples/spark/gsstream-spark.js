@@ -8,8 +8,9 @@ import * as THREE from "three";
 
 import { pivotOf, viewsOf } from "./site/camera.js";
 import { Player } from "./site/player.js";
-import { ResidentScene } from "./site/resident.js";
-import { GEOMETRY_TEXELS, colourFunction, colourTexels } from "./site/shaders.js";
+import { SceneTextures } from "./site/scene-textures.js";
+import { colourFunction } from "./site/shaders.js";
+import { GEOMETRY_TEXELS, colourTexels, shiftOf } from "./site/texels.js";
 
 /** Options of a SparkRenderer with which pictures look as these scenes were trained. */
 export const AS_TRAINED = {
@@ -26,10 +27,10 @@ export const AS_TRAINED = {
 class StreamSource {
   constructor(renderer) {
     this.renderer = renderer;
-    this.scene = new ResidentScene(renderer.getContext());
+    this.textures = new SceneTextures(renderer.getContext());
+    this.positions = new Float32Array(0);
     this.geometry = new dyno.DynoSampler2D({ key: "gsstreamGeometry", value: new THREE.ExternalTexture() });
     this.colours = new dyno.DynoSampler2D({ key: "gsstreamColours", value: new THREE.ExternalTexture() });
-    this.state = null;
     this.most = 3;
     this.uploaded = 0;
     this.changed = false;
@@ -37,10 +38,27 @@ class StreamSource {
 
   // What a player asks of its renderer.
 
-  update(state) {
-    this.state = state;
-    this.scene.update(state);
+  take(update, deadline) {
+    const { gl } = this.textures;
+    // three.js may have left its own ways of unpacking behind, and does not know what is done behind its back.
+    for (const name of ["UNPACK_FLIP_Y_WEBGL", "UNPACK_PREMULTIPLY_ALPHA_WEBGL"]) gl.pixelStorei(gl[name], false);
+    for (const name of ["UNPACK_ROW_LENGTH", "UNPACK_SKIP_PIXELS", "UNPACK_SKIP_ROWS"]) gl.pixelStorei(gl[name], 0);
+    gl.bindBuffer(gl.PIXEL_UNPACK_BUFFER, null);
+    const whole = this.textures.take(update, deadline);
+    this.renderer.resetState();
+    if (!whole) return false;
+    this.uploaded = this.textures.uploaded;
+    const { slots, positions } = update.places;
+    if (slots) slots.forEach((slot, i) => this.positions.set(positions.subarray(3 * i, 3 * i + 3), 3 * slot));
+    else this.positions = positions;
+    for (const name of ["geometry", "colours"]) {
+      const { texture } = this.textures[name];
+      if (this[name].value.sourceTexture === texture) continue;
+      this[name].value = new THREE.ExternalTexture(texture);
+      this[name].uniform.value = this[name].value;
+    }
     this.changed = true;
+    return true;
   }
 
   draw() {
@@ -48,8 +66,7 @@ class StreamSource {
   }
 
   dispose() {
-    for (const { texture } of [this.scene.textures.geometry, this.scene.textures.colours ?? {}])
-      if (texture) this.scene.gl.deleteTexture(texture);
+    this.textures.dispose();
   }
 
   // What Spark asks of a source.
@@ -57,7 +74,7 @@ class StreamSource {
   prepareFetchSplat() {}
 
   getNumSplats() {
-    return this.state ? this.scene.slots.used : 0;
+    return this.textures.used;
   }
 
   hasRgbDir() {
@@ -65,7 +82,7 @@ class StreamSource {
   }
 
   getNumSh() {
-    return Math.max(this.scene.textures.degree, 0);
+    return Math.max(this.textures.degree, 0);
   }
 
   setMaxSh(most) {
@@ -75,7 +92,7 @@ class StreamSource {
   fetchSplat({ index, viewOrigin }) {
     const degree = viewOrigin ? this.getNumSh() : 0;
     const texels = colourTexels(this.getNumSh());
-    const [lines, colourLines] = [GEOMETRY_TEXELS, texels].map((number) => Math.floor(Math.log2(2048 / number)));
+    const [lines, colourLines] = [GEOMETRY_TEXELS, texels].map(shiftOf);
     const inTypes = { index: "int", geometry: "sampler2D", colours: "sampler2D" };
     const inputs = { index, geometry: this.geometry, colours: this.colours };
     if (viewOrigin) {
@@ -105,39 +122,21 @@ class StreamSource {
     }).outputs.gsplat;
   }
 
+  /** Of each splat its centre alone, which is what boxes are made of; the rest is in the graphics. */
   forEachSplat(callback) {
-    const { state } = this;
-    for (let row = 0; row < (state?.number ?? 0); row += 1) {
-      const { means, quats, scales, opacities, sh0 } = state.scene;
-      const [w, x, y, z] = quats.subarray(4 * row, 4 * row + 4);
-      callback(
-        this.scene.slots.slotOf[row],
-        new THREE.Vector3(...means.subarray(3 * row, 3 * row + 3)),
-        new THREE.Vector3(...Array.from(scales.subarray(3 * row, 3 * row + 3), Math.exp)),
-        new THREE.Quaternion(x, y, z, w).normalize(),
-        1 / (1 + Math.exp(-opacities[row])),
-        new THREE.Color(...Array.from(sh0.subarray(3 * row, 3 * row + 3), (v) => 0.5 + 0.28209479177387814 * v)),
-      );
+    const { positions } = this;
+    for (let slot = 0; slot < this.getNumSplats(); slot += 1) {
+      const center = new THREE.Vector3(...positions.subarray(3 * slot, 3 * slot + 3));
+      if (Number.isNaN(center.x)) continue;
+      callback(slot, center, new THREE.Vector3(), new THREE.Quaternion(), 1, new THREE.Color());
     }
   }
 
-  /** Upload what changed since the last call; returns whether anything did. */
+  /** Whether anything changed since the last call. */
   flush() {
-    if (!this.changed) return false;
+    const { changed } = this;
     this.changed = false;
-    const { gl, textures } = this.scene;
-    // three.js may have left its own ways of unpacking behind, and does not know what is done behind its back.
-    for (const name of ["UNPACK_FLIP_Y_WEBGL", "UNPACK_PREMULTIPLY_ALPHA_WEBGL"]) gl.pixelStorei(gl[name], false);
-    for (const name of ["UNPACK_ROW_LENGTH", "UNPACK_SKIP_PIXELS", "UNPACK_SKIP_ROWS"]) gl.pixelStorei(gl[name], 0);
-    gl.bindBuffer(gl.PIXEL_UNPACK_BUFFER, null);
-    this.uploaded = textures.flush();
-    this.renderer.resetState();
-    for (const name of ["geometry", "colours"]) {
-      if (this[name].value.sourceTexture === textures[name].texture) continue;
-      this[name].value = new THREE.ExternalTexture(textures[name].texture);
-      this[name].uniform.value = this[name].value;
-    }
-    return true;
+    return changed;
   }
 }
 
@@ -161,7 +160,7 @@ export class SplatStream {
     return this.player.open(url);
   }
 
-  /** Hand what changed since the last picture to the graphics. */
+  /** Tell Spark what changed since the last picture. */
   update() {
     if (!this.source.flush()) return;
     if (this.degree !== this.source.getNumSh()) {

@@ -1,0 +1,86 @@
+"""Decoding beside the page's thread: that it is done there, and what a page does that may have no worker."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from browser_runs import PLAYER, READY, WITHOUT_WORKERS, at, in_browser, needs_browser, serving, try_in_browser
+from pictures import decoded, drawn, psnr
+
+from gsstream.player.playback import Playback
+
+pytestmark = needs_browser
+#: Modules that the page itself has loaded; those of workers are not among them.
+MODULES = "performance.getEntriesByType('resource').map(({ name }) => name.split('/').pop())"
+#: A page of somebody else; POLICY stands in its head, PLACE is where the player lies.
+OUTER = """<!doctype html>POLICY<script type="module" src="PLACE/element.js"></script>
+<gsstream-player src="PLACE/stream.json" style="width: 200px"></gsstream-player>"""
+POLICIES = {
+    "none": "",
+    "no workers": "<meta http-equiv='Content-Security-Policy' content=\"worker-src 'none'\">",
+    "no blobs": "<meta http-equiv='Content-Security-Policy' content=\"worker-src 'self'\">",
+}
+#: A picture of frame 9 as text, and whether a worker decodes.
+LOOK = [["picture", 9, 32, 24], ["evaluate", f"Boolean({PLAYER}.link.worker)"], ["evaluate", MODULES]]
+
+
+def check(results: list, site, *, worker: bool) -> None:
+    picture, found, modules = results[-3:]
+    with Playback(site / "stream.gss") as playback:
+        assert psnr(drawn(playback, 9), decoded(picture, 32, 24)) >= 45
+    assert found is worker
+    assert ("decode.js" in modules) is not worker
+    assert "renderer.js" in modules
+
+
+@pytest.mark.parametrize("worker", [True, False])
+def test_nothing_of_a_packet_comes_to_the_page(site, tmp_path, worker):
+    steps = [*([] if worker else [WITHOUT_WORKERS]), ["go", "URL/index.html"], READY, *LOOK]
+    with serving(site) as (url, _):
+        results = in_browser(at(url, steps), tmp_path, size=(120, 90))
+    check(results, site, worker=worker)
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_other_peoples_pages_play_whatever_they_allow(site, tmp_path, policy, elsewhere):
+    """The player may lie on another origin, whose modules are no workers of the page; a policy may forbid workers."""
+    worker = policy == "none" or (policy == "no blobs" and not elsewhere)
+    name = f"outer-{policy.replace(' ', '-')}-{elsewhere}.html"
+    with serving(site) as (url, _), serving(site, cors=True) as (other, _):
+        text = OUTER.replace("POLICY", POLICIES[policy]).replace("PLACE", other if elsewhere else url)
+        (site / name).write_text(text)
+        results, _ = try_in_browser([["go", f"{url}/{name}"], READY, *LOOK], tmp_path)
+    check(results, site, worker=worker)
+
+
+def test_the_newest_of_many_seeks_wins(site, tmp_path):
+    """Seeks come faster than frames; each is answered by the right picture or by none."""
+    seeks = "; ".join(f"{PLAYER}.seek({frame})" for frame in (11, 3, 0, 7, 2, 10, 5))
+    shown = f"window.shown = []; {PLAYER}.addEventListener('frame', () => shown.push({PLAYER}.frame)); {seeks}"
+    steps = [
+        ["go", "URL/index.html"], READY, ["evaluate", shown], ["until", f"{PLAYER}._target === null"],
+        ["evaluate", f"[{PLAYER}.frame, shown]"], ["picture", 5, 32, 24], ["picture", 6, 32, 24],
+    ]  # fmt: skip
+    with serving(site) as (url, _), Playback(site / "stream.gss") as playback:
+        *_, (frame, seen), five, six = in_browser(at(url, steps), tmp_path, size=(120, 90))
+        assert (frame, seen[-1]) == (5, 5)
+        for number, text in ((5, five), (6, six)):
+            assert psnr(drawn(playback, number), decoded(text, 32, 24)) >= 45
+
+
+@pytest.mark.parametrize("playing", [False, True])
+def test_graphics_that_forget_everything_get_it_again(site, tmp_path, playing):
+    """A context is lost, frames go by, and it comes back: the pictures are those of before."""
+    extension = f"(window.loss ??= {PLAYER}.renderer.gl.getExtension('WEBGL_lose_context'))"
+    steps = [
+        ["go", "URL/index.html?speed=4"], READY, ["picture", 3, 32, 24],
+        ["evaluate", f"{PLAYER}.{'play' if playing else 'pause'}(), {extension}.loseContext()"], ["pause", 400],
+        ["evaluate", "loss.restoreContext()"], ["pause", 300], ["evaluate", f"{PLAYER}.pause()"],
+        ["picture", 3, 32, 24], ["picture", 8, 32, 24],
+    ]  # fmt: skip
+    with serving(site) as (url, _), Playback(site / "stream.gss") as playback:
+        results = in_browser(at(url, steps), tmp_path, size=(120, 90))
+        before, again, later = (decoded(results[i], 32, 24) for i in (2, 8, 9))
+        assert np.array_equal(before, again)
+        assert psnr(drawn(playback, 8), later) >= 45

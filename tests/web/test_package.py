@@ -45,11 +45,27 @@ def test_every_module_is_one_that_the_page_may_load():
             continue
         found.add(name)
         text, folder = (WEB / name).read_text(encoding="utf-8"), (WEB / name).parent
-        named = re.findall(r"""(?:from|import|URL|href=|src=)[ (]*["']((?:\.\.?/)?[\w/.-]+\.js)["']""", text)
+        named = re.findall(r"""(?:from|import|Worker|URL|href=|src=)[ (]*["']((?:\.\.?/)?[\w/.-]+\.js)["']""", text)
         waiting += [(folder / path).resolve().relative_to(WEB).as_posix() for path in named]
     there = {path.relative_to(WEB).as_posix() for path in WEB.rglob("*.js")}
     assert found - {"index.html"} == there
     assert len(there) > 20
+
+
+def test_the_worker_asks_for_all_its_modules_at_once():
+    """A module that only another one names would come a round trip later."""
+    found, waiting = set(), ["stream.js"]
+    while waiting:
+        name = waiting.pop()
+        found.add(name)
+        named = re.findall(
+            r"""^(?:import|\}|export) ?.*["'](\.\.?/[\w/.-]+\.js)["'];$""", (WEB / name).read_text(), re.MULTILINE
+        )
+        paths = {(WEB / name).parent.joinpath(path).resolve().relative_to(WEB).as_posix() for path in named}
+        waiting += paths - found
+    lists = re.findall(r"""const MO\w+ = "([^"]*)";""", (WEB / "stream-worker.js").read_text())
+    assert {f"{name}.js" for text in lists for name in text.split()} == found
+    assert "changes/residual.js" in found
 
 
 @pytest.mark.parametrize("example", sorted(EXAMPLES.rglob("*.js")), ids=lambda path: path.name)

@@ -6,8 +6,9 @@ import { Renderer } from "./renderer.js";
 import { regionOf } from "./region.js";
 import { StreamLink } from "./stream-link.js";
 
-/** Milliseconds of a turn in which what came is handed to the graphics. */
+/** Milliseconds of a turn in which what came is handed to the graphics; of the first, while there is nothing to see. */
 const UPLOAD = 4;
+const FIRST_UPLOAD = 12;
 /** Seconds of playing that may be left out at once when frames come late. */
 const LATE = 0.25;
 
@@ -37,7 +38,7 @@ export class Player extends EventTarget {
     this.statistics = { drawn: 0, decode: 0, bytes: 0, uploaded: 0 };
     /** What draws in the place of the canvas, and calls `turn` for every picture: a headset. */
     this.driver = null;
-    this._number = this._clock = this._taken = 0;
+    this._number = this._serial = this._clock = this._taken = 0;
     this._then = null;
     this._dirty = this._closed = this.drew = false;
     this._reset();
@@ -69,9 +70,10 @@ export class Player extends EventTarget {
     const { frame } = this;
     this._came = [];
     this.state = null;
-    this._target = this._asked = frame;
+    this._target = frame;
     this._number += 1;
-    this.link.post("choose", this._number, index, frame);
+    this._serial += 1;
+    this.link.post("choose", this._number, index, frame, this._serial);
     return this._opening();
   }
 
@@ -112,7 +114,7 @@ export class Player extends EventTarget {
   /** Show a frame as soon as it is there. A live stream only shows its newest. */
   seek(frame) {
     if (this.buffer?.live) return;
-    this._ask(Math.max(this.first, Math.min(Math.round(frame), this.last)));
+    this._ask(Math.max(this.first, Math.min(Math.round(frame), this.buffer?.last ?? Infinity)));
     this._seeking = true;
     this._clock = 0;
   }
@@ -188,7 +190,7 @@ export class Player extends EventTarget {
     const seconds = this._then === null ? 0 : Math.min((now - this._then) / 1000, 0.25);
     this._then = now;
     this.options.beforeFrame?.(seconds);
-    this._take(performance.now() + UPLOAD);
+    this._take(performance.now() + (this.drew ? UPLOAD : FIRST_UPLOAD));
     if (!this.buffer?.live) this._advance(seconds);
   }
 
@@ -212,7 +214,7 @@ export class Player extends EventTarget {
 
   _reset() {
     this.source = this.buffer = this.state = this.view = this.problem = this.latency = null;
-    this._target = this._asked = this._opened = this._glimpse = this._meta = null;
+    this._target = this._opened = this._glimpse = this._meta = null;
     this._came = [];
     this._unheard = [];
     this._scenes = [];
@@ -272,13 +274,13 @@ export class Player extends EventTarget {
     }
   }
 
-  _frame({ frame, gaussians, packets, key, statistics }) {
+  _frame({ frame, gaussians, packets, key, statistics, serial }) {
     this.state = { frame, number: gaussians, meta: this._meta };
     Object.assign(this.statistics, statistics, { key });
     // After a jump, of more than one packet or to a key packet, the order of before is far from right.
     this._taken += packets + key;
     if (this.view === null) this._ready();
-    if (this._target === frame || this._asked === frame) this._target = null;
+    if (serial === this._serial) this._target = null;
     if (this._target === null) this._seeking = false;
     if (this.buffer.live) this.link.post("feed");
     this._opened?.resolve();
@@ -311,8 +313,9 @@ export class Player extends EventTarget {
   }
 
   _ask(frame) {
-    this._target = this._asked = frame;
-    this.link.post("to", frame);
+    this._target = frame;
+    this._serial += 1;
+    this.link.post("to", frame, this._serial);
   }
 
   _firstView() {
@@ -332,9 +335,8 @@ export class Player extends EventTarget {
   }
 
   /** Something is wrong. What cannot be gone on with ends the playing. */
-  _stop({ problem, kind, ended, next = null }) {
+  _stop({ problem, kind, ended }) {
     this.problem = problem || null;
-    if (next !== null) this._target = next;
     if (ended) {
       this.playing = false;
       this._target = null;

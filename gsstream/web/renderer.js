@@ -51,6 +51,8 @@ export class Renderer {
     // After a loss only all of a scene is of use.
     const usable = this.textures.geometry || update.textures.geometry.all;
     if (usable && !this.gl.isContextLost()) {
+      // While it uploads what nothing is drawn with yet.
+      if (this.frame === null) this.projection.compile(update.degree);
       if (!this.textures.take(update, deadline)) return false;
       this.uploaded = this.textures.uploaded;
       this.frame = update.frame;

@@ -47,13 +47,17 @@ export class Projection {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  /** Make room for `scene` (SceneTextures), and begin to compile what it takes. */
+  /** Begin to compile what scenes of a degree take. */
+  compile(degree) {
+    if (degree === this.degree) return;
+    this.degree = degree;
+    this.program = link(this.gl, COPY_VERTEX_SHADER, projectionShader(degree));
+  }
+
+  /** Make room for `scene` (SceneTextures). */
   fit({ geometry: { shift, capacity }, degree }) {
     const { gl } = this;
-    if (degree !== this.degree) {
-      this.degree = degree;
-      this.program = link(gl, COPY_VERTEX_SHADER, projectionShader(degree));
-    }
+    this.compile(degree);
     const lines = capacity / 2 ** shift;
     if (lines === this.lines && shift === this.shift) return;
     this.textures.forEach((texture) => gl.deleteTexture(texture));

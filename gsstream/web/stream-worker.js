@@ -9,21 +9,21 @@ const waiting = [];
 let stream = null;
 
 self.onmessage = ({ data }) => {
-  if (data[0] === "open" && !stream) ahead(data[2]);
-  if (stream) stream.hear(data);
+  if (data[0] === "manifest") ahead(data[1], data[2]);
+  else if (stream) stream.hear(data);
   else waiting.push(data);
 };
 
-/** Ask for a manifest and its first segment at once: they need not wait until all modules are there. */
-function ahead(url) {
-  if (!new URL(url).pathname.endsWith(".json") || !/^http/.test(url)) return;
-  const answer = fetch(url);
-  begun.set(url, answer);
-  const first = ({ segments: [{ file, joins }] }) => {
+/** Ask for the first segment of a manifest at once: it need not wait until all modules are there. */
+function ahead(url, text) {
+  begun.set(url, Promise.resolve(new Response(text)));
+  try {
+    const [{ file, joins }] = JSON.parse(text).segments;
     const href = file && !joins?.length && new URL(file, url).href;
-    if (href) begun.set(href, fetch(href));
-  };
-  answer.then((found) => found.clone().json()).then(first).catch(() => {});
+    if (href) begun.set(href, fetch(href, { priority: "high" }));
+  } catch {
+    // Whatever it is, who opens it says what is wrong.
+  }
 }
 
 const loaded = Promise.all([...MODULES.split(" "), ...MORE.split(" ")].map((name) => import(`./${name}.js`)));

@@ -12,16 +12,17 @@ import { openSource } from "./source.js";
 const REPORT = 100;
 
 /**
- * Hears `[name, ...arguments]`: `open` number url, `choose` number rendition frame, `to` frame, `play` on, `feed`,
+ * Hears `[name, ...arguments]`: `open` number url, `choose` number rendition frame serial, `to` frame serial,
+ * `play` on, `feed`,
  * `retry`, `whole`, `scene`, `close`. Says objects with the `number` under which the stream was opened, one of:
  * `opened`; `frame` (what Packer packed, and `frame`, `gaussians`, `packets` and `key`: how many were decoded for it,
- * and whether there was a key packet; `meta` where it is another, `loaded`, `statistics`); `early` (the
+ * and whether there was a key packet; `serial` of the request that it answers; `meta` where it is another, `loaded`, `statistics`); `early` (the
  * same of a first layer); `loaded`; `problem` (a sentence, its `kind` and whether playing has `ended`); `scene`.
  */
 export class Stream {
   /** `post(message, buffers)` says a message and gives buffers away; it decodes for `budget` milliseconds, then hears. */
   constructor(post, budget) {
-    Object.assign(this, { post, budget, number: 0, playing: false, running: false, timer: null });
+    Object.assign(this, { post, budget, number: 0, serial: 0, playing: false, running: false, timer: null });
     this.snapshots = new Snapshots();
     this.packer = new Packer();
     this.source = this.buffer = this.state = this.target = null;
@@ -53,16 +54,16 @@ export class Stream {
   }
 
   /** Go on with another rendition of the recording, from the key packet before a frame. */
-  choose(number, index, frame) {
+  choose(number, index, frame, serial) {
     this.buffer.dispose();
     this.state = null;
-    this.number = number;
+    Object.assign(this, { number, serial });
     this._start(this.source.renditions[index].segments, frame);
   }
 
   /** Decode up to a frame and say it. */
-  to(frame) {
-    this.target = frame;
+  to(frame, serial) {
+    Object.assign(this, { target: frame, serial });
     this.buffer?.want(frame, this.frame);
     this._run();
   }
@@ -115,7 +116,7 @@ export class Stream {
   fail(error) {
     const damaged = error instanceof PacketError;
     this.target = (damaged && this.playing ? this.buffer?.nextSegment(this.target) : null) ?? null;
-    this.say({ problem: error.message, kind: error.name, ended: this.target === null, next: this.target });
+    this.say({ problem: error.message, kind: error.name, ended: this.target === null });
   }
 
   /** Decode one packet, or begin where a join says. */
@@ -138,7 +139,8 @@ export class Stream {
   sendFrame() {
     this.hungry = false;
     const { packets, key, statistics } = this;
-    this._send("frame", this.state, { loaded: this._loaded(), packets, key, statistics });
+    const serial = this.target === null ? this.serial : null;
+    this._send("frame", this.state, { loaded: this._loaded(), packets, key, statistics, serial });
     this.packets = 0;
     this.key = false;
   }
@@ -203,8 +205,10 @@ export class Stream {
 
   /** Decode one packet towards the target; returns whether to go on. */
   _step() {
-    const { buffer, target } = this;
-    if (!buffer || target === null) return false;
+    const { buffer } = this;
+    if (!buffer || this.target === null) return false;
+    // Where a file without an index ends is known only now.
+    const target = Math.min(this.target, buffer.last ?? Infinity);
     if (this.frame === target) {
       this.target = null;
       this.sendFrame();
@@ -228,6 +232,9 @@ export class Stream {
     const failure = this.buffer.failure(frame, this.frame);
     if (failure) this.fail(failure);
     else this.buffer.want(frame, this.frame);
+    // A download that is given up for another one tells nobody.
+    clearTimeout(this.again);
+    this.again = setTimeout(() => this._run(), REPORT);
     return Boolean(failure);
   }
 

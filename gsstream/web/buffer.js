@@ -193,13 +193,14 @@ export class PacketBuffer {
     place.state = "loading";
     try {
       await (job.join ? this._loadJoin(part, abort.signal) : this._loadPackets(part, abort.signal));
-      place.state = "done";
+      if (!abort.signal.aborted) place.state = "done";
     } catch (error) {
-      if (abort.signal.aborted) {
-        this._unfinished();
-        return;
-      }
-      Object.assign(place, { state: "failed", error });
+      if (!abort.signal.aborted) Object.assign(place, { state: "failed", error });
+    }
+    // What was given up may have come to its end all the same, and what it brought may have been forgotten.
+    if (abort.signal.aborted) {
+      this._unfinished();
+      return;
     }
     this.loading = null;
     this._unfinished();

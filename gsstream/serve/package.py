@@ -214,7 +214,8 @@ def _poster(stream: Path) -> bytes:
 def _titled(page: str, name: str) -> str:
     """Return the page with a title, and the preview that other pages show of a link to it."""
     title = html.escape(name)
-    tags = f'<meta property="og:title" content="{title}">\n<meta property="og:image" content="{POSTER}">'
+    tags = f"""<link rel="preload" as="image" href="{POSTER}">
+<meta property="og:title" content="{title}">\n<meta property="og:image" content="{POSTER}">"""
     return page.replace("<title>gsstream</title>", f"<title>{title}</title>\n{tags}").replace(
         "<h1>gsstream</h1>", f"<h1>{title}</h1>"
     )

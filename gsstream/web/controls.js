@@ -41,6 +41,12 @@ export class Controls {
     this.abort.abort();
   }
 
+  /** Turn around the scene by angles in radians, and go nearer (factor below 1) or farther away. */
+  turn(yaw, pitch, factor = 1) {
+    const { scene } = this;
+    if (scene.view) this._set(zoomed(orbited(scene.view, scene.pivot, yaw, pitch), scene.pivot, factor));
+  }
+
   /** Fly with the keys that are held, for `seconds`, or go back into the region when nothing holds the view outside. */
   fly(seconds) {
     const { scene } = this;
@@ -48,7 +54,8 @@ export class Controls {
     const speed = 0.6 * distance(scene.view, scene.pivot) * seconds;
     for (const key of this.held) this._shift(FLY[key].map((v) => v * speed));
     if (this.held.size || this.pointers.size || !this.outside) return;
-    this._place(scene.view, this.outside < 0.01 ? 1 : 1 - Math.exp(-seconds / RETURN), 0);
+    const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
+    this._place(scene.view, still || this.outside < 0.01 ? 1 : 1 - Math.exp(-seconds / RETURN), 0);
   }
 
   /** 0 while the view is within the recorded region, 1 where the picture has faded. */

@@ -1,5 +1,7 @@
 // Bytes of a file from a web server, in order, through the ways in which servers and connections fail.
 
+import { reasonOf } from "./reasons.js";
+
 /** Why nothing comes, in one sentence for the viewer of the page. */
 export class SourceError extends Error {
   constructor(message) {
@@ -96,6 +98,8 @@ export async function* bytesOf(url, { start = 0, end = null, whole = false, all 
     } catch (error) {
       if (signal?.aborted || error.final) throw error;
       failures += 1;
+      // Nothing came yet: there may be a reason for which waiting does not help.
+      if (at === start) await forbidden(url, error);
       if (failures > RETRIES) throw new SourceError(`${sentence(error)} What was loaded until then is played.`);
       await sleep(settings.firstPause * 2 ** (failures - 1), signal);
     }
@@ -113,7 +117,7 @@ function firstByte(response, url, at) {
   const error = new SourceError(
     response.status === 401
       ? "This stream needs a token: add ?token=… to the address of the page."
-      : `There is no stream at ${url}: the server answers ${response.status}.`,
+      : `There is no stream at ${url}: the server answers ${response.status}. Look whether the address is right.`,
   );
   error.final = response.status < 500;
   throw error;
@@ -136,6 +140,13 @@ export async function fileOf(url, { bytes = null, signal } = {}) {
   const parts = [];
   for await (const chunk of bytesOf(url, { end: bytes && bytes - 1, whole: true, signal })) parts.push(chunk);
   return new Uint8Array(await new Blob(parts).arrayBuffer());
+}
+
+/** Throw a final SourceError where a request for `url` failed for a reason that can be told and will not pass. */
+export async function forbidden(url, error) {
+  if (error instanceof SourceError || error.name === "PacketError") return;
+  const reason = await reasonOf(url, settings.fetch);
+  if (reason) throw Object.assign(new SourceError(reason), { final: true });
 }
 
 function sentence(error) {

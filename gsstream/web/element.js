@@ -8,11 +8,15 @@ import { Controls } from "./controls.js";
 import { PAGE, PAUSE, PLAY, STYLE } from "./look.js";
 import { Player } from "./player.js";
 
+/** What is left of a picture that is seen from as far outside of the recorded region as a hand may drag it. */
+const LEFT = 0.4;
+/** Radians by which an arrow turns, and the factor by which plus and minus zoom. */
+const [TURN, ZOOM] = [Math.PI / 36, 1.1];
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4];
 
 /** The custom element; `player` is its Player, for scripts. */
 export class PlayerElement extends HTMLElement {
-  static observedAttributes = ["src"];
+  static observedAttributes = ["src", "camera", "speed", "loop", "controls", "marks"];
 
   connectedCallback() {
     const root = this.shadowRoot ?? this.attachShadow({ mode: "open", delegatesFocus: true });
@@ -29,6 +33,7 @@ export class PlayerElement extends HTMLElement {
     this._listen();
     this._poster(this.getAttribute("poster"));
     if (this.hasAttribute("src")) this.load(this.getAttribute("src"));
+    else this._tell("No stream is named. Give the player an attribute src: the address of a stream.json or a .gss file.");
   }
 
   disconnectedCallback() {
@@ -39,7 +44,14 @@ export class PlayerElement extends HTMLElement {
   }
 
   attributeChangedCallback(name, before, after) {
-    if (this.player && before !== after && after) this.load(after);
+    const { player } = this;
+    if (!player || before === after) return;
+    if (name === "src" && after) this.load(after);
+    if (name === "camera") this._look(after);
+    if (name === "speed") this._speed(Number(after ?? 1));
+    if (name === "loop") this._loop(after !== "false");
+    if (name === "controls") this.parts.bar.hidden = after === "false" || !player.drew;
+    if (name === "marks") this._marks(after !== null);
   }
 
   /** Open a stream. What goes wrong is said in the page; the promise resolves in any case. */
@@ -49,7 +61,9 @@ export class PlayerElement extends HTMLElement {
     try {
       await this.player.open(url);
       if (this.player.problem) this._tell(this.player.problem);
-      if (this.hasAttribute("autoplay")) this.player.play();
+      // Who wants no motion begins it.
+      const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
+      if (this.hasAttribute("autoplay") && !still) this.player.play();
     } catch (error) {
       if (error.name !== "AbortError") this._tell(error.message);
     }
@@ -91,9 +105,7 @@ export class PlayerElement extends HTMLElement {
     parts.speed.replaceChildren(
       ...SPEEDS.map((speed) => new Option(`${speed}×`, speed, false, speed === player.speed)),
     );
-    parts.speed.onchange = () => {
-      player.speed = Number(parts.speed.value);
-    };
+    parts.speed.onchange = () => this._speed(Number(parts.speed.value));
     parts.camera.onchange = () => player.look(parts.camera.selectedIndex);
     // What goes wrong is told by the event `problem`.
     parts.rendition.onchange = () => player.choose(parts.rendition.selectedIndex).catch(() => {});
@@ -103,6 +115,7 @@ export class PlayerElement extends HTMLElement {
     parts.full.onclick = () => this._full();
     parts.more.onclick = () => this._more();
     parts.canvas.addEventListener("pointerdown", () => this._more(false));
+    this.addEventListener("focusin", () => this._wake());
     parts.poster.onload = () => {
       parts.poster.hidden = this.player.drew;
     };
@@ -112,7 +125,7 @@ export class PlayerElement extends HTMLElement {
     player.addEventListener("drawn", () => this._drawn());
     player.addEventListener("state", () => this._progress());
     player.addEventListener("view", () => {
-      parts.canvas.style.opacity = 1 - this.controls.outside;
+      parts.canvas.style.opacity = 1 - (1 - LEFT) * this.controls.outside;
     });
     player.addEventListener("problem", ({ detail }) => this._tell(detail));
     this.addEventListener("keydown", (event) => this._key(event));
@@ -130,6 +143,30 @@ export class PlayerElement extends HTMLElement {
       this._tell("");
       this.player.play();
     }
+    this._say(this.player.playing ? "Playing" : "Paused");
+  }
+
+  /** Tell a screen reader what was done. */
+  _say(text) {
+    this.parts.said.textContent = text;
+  }
+
+  _speed(speed) {
+    this.player.speed = speed;
+    this.parts.speed.value = speed;
+  }
+
+  /** Look through a camera of the recording by its id; where there is none of this id, say so. */
+  _look(id) {
+    const { views } = this.player;
+    const index = views.findIndex((view) => view.id === id);
+    if (index >= 0) this.player.look(index);
+    else if (views.length && id !== null) {
+      const names = views.slice(0, 5).map((view) => view.id).join(", ");
+      this.notice = `The recording has no camera "${id}". It has ${names}${views.length > 5 ? " and others" : ""}.`;
+      this._tell(this.notice);
+    }
+    this.parts.camera.selectedIndex = Math.max(index, 0);
   }
 
   _marks(on = !this.player.marks) {
@@ -155,7 +192,8 @@ export class PlayerElement extends HTMLElement {
   _drawn() {
     this.parts.poster.hidden = true;
     this.parts.bar.hidden = this.getAttribute("controls") === "false";
-    this._tell(this.player.problem ?? "");
+    this.style.background = "";
+    this._tell(this.player.problem ?? this.notice ?? "");
   }
 
   async _statistics() {
@@ -175,6 +213,9 @@ export class PlayerElement extends HTMLElement {
     const { parts, player } = this;
     parts.camera.replaceChildren(...player.views.map((view, i) => new Option(`View ${i + 1}`)));
     parts.camera.hidden = player.views.length < 2;
+    parts.camera.selectedIndex = player.views.findIndex(({ id }) => id === player.view.id);
+    this.notice = null;
+    if (this.hasAttribute("camera")) this._look(this.getAttribute("camera"));
     const renditions = player.source.renditions;
     parts.rendition.hidden = renditions.length < 2;
     parts.rendition.replaceChildren(...renditions.map(({ name }) => new Option(name)));
@@ -185,6 +226,7 @@ export class PlayerElement extends HTMLElement {
     const { parts, player } = this;
     if (!player || player.frame === null || !player.source) return;
     parts.play.querySelector("path").setAttribute("d", player.playing ? PAUSE : PLAY);
+    parts.play.ariaLabel = player.playing ? "Pause" : "Play";
     this.toggleAttribute("still", !player.source.live && player.buffer.last === player.first);
     parts.space.hidden = !this.hasAttribute("still");
     parts.seek.min = player.first;
@@ -197,6 +239,7 @@ export class PlayerElement extends HTMLElement {
     }
     const seconds = (frame) => ((frame - player.first) / player.fps).toFixed(1);
     parts.time.textContent = `${seconds(player.frame)} / ${seconds(player.last)} s`;
+    parts.seek.ariaValueText = `${seconds(player.frame)} of ${seconds(player.last)} seconds`;
   }
 
   _everySecond() {
@@ -216,30 +259,49 @@ export class PlayerElement extends HTMLElement {
   }
 
   _key(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || event.composedPath()[0] instanceof HTMLSelectElement) return;
-    const { player } = this;
-    const speed = (step) => {
-      player.speed = SPEEDS[Math.max(0, Math.min(SPEEDS.length - 1, SPEEDS.indexOf(player.speed) + step))] ?? 1;
-      this.parts.speed.value = player.speed;
+    const [part] = event.composedPath();
+    if (event.ctrlKey || event.metaKey || event.altKey || part instanceof HTMLSelectElement) return;
+    // A control that has the focus is pressed, or moved, by the keys that do so everywhere.
+    if (part instanceof HTMLButtonElement && [" ", "Enter"].includes(event.key)) return;
+    if (part instanceof HTMLInputElement && /^(Arrow|Home|End|Page)/.test(event.key)) return;
+    const { player, controls } = this;
+    const faster = (step) => {
+      const at = SPEEDS.indexOf(player.speed) + step;
+      this._speed(SPEEDS[Math.max(0, Math.min(SPEEDS.length - 1, at))] ?? 1);
+      this._say(`Speed ${player.speed}`);
     };
     const step = (way) => {
       player.pause();
       player.seek(player.frame + way);
+      this._say(`Frame ${player.frame + way}`);
     };
     const actions = {
       " ": () => this._toggle(),
-      ArrowRight: () => step(1),
-      ArrowLeft: () => step(-1),
+      ArrowRight: () => controls.turn(TURN, 0),
+      ArrowLeft: () => controls.turn(-TURN, 0),
+      ArrowUp: () => controls.turn(0, -TURN),
+      ArrowDown: () => controls.turn(0, TURN),
+      "+": () => controls.turn(0, 0, 1 / ZOOM),
+      "=": () => controls.turn(0, 0, 1 / ZOOM),
+      "-": () => controls.turn(0, 0, ZOOM),
+      ".": () => step(1),
+      ",": () => step(-1),
+      ">": () => faster(1),
+      "<": () => faster(-1),
       Home: () => player.seek(player.first),
       End: () => player.seek(player.last),
       g: () => this._marks(),
       i: () => this._statistics(),
       f: () => this._full(),
-      "+": () => speed(1),
-      "-": () => speed(-1),
       l: () => this._loop(),
       r: () => player.look(Math.max(0, this.parts.camera.selectedIndex)),
     };
+    if (this.hasAttribute("more")) {
+      actions.Escape = () => {
+        this._more(false);
+        this.parts.more.focus();
+      };
+    }
     const number = Number(event.key) - 1;
     if (number >= 0 && number < player.views.length && event.key !== " ") {
       this.parts.camera.selectedIndex = number;

@@ -1,7 +1,7 @@
 // A stream file by itself, with or without an index. The player of a package never loads this.
 
 import { FILE_HEADER, parseHeader, parseIndex } from "./container.js";
-import { SourceError, bytesOf, chunksOf, request } from "./download.js";
+import { SourceError, bytesOf, chunksOf, forbidden, request } from "./download.js";
 
 const TRAILER = 12;
 
@@ -12,13 +12,14 @@ export async function openFile(url, signal) {
     const opened = (stop) => (answer && !answer.bodyUsed ? continued(answer, url, stop) : null);
     return { segments: [{ ...sequential, opened }], frames: null, fps: null, renditions: [] };
   };
-  const response = await request(url, { start: -TRAILER, signal }).catch((error) => {
+  const response = await request(url, { start: -TRAILER, signal }).catch(async (error) => {
+    if (!signal?.aborted) await forbidden(url, error);
     throw error instanceof SourceError || signal?.aborted ? error : new SourceError(`There is no server at ${url}.`);
   });
   if (response.status === 200) return plain(response);
   if (response.status === 416) return plain();
   if (response.status !== 206)
-    throw new SourceError(`There is no stream at ${url}: the server answers ${response.status}.`);
+    throw new SourceError(`There is no stream at ${url}: the server answers ${response.status}. Look whether the address is right.`);
   const total = /\/(\d+)$/.exec(response.headers.get("Content-Range") ?? "");
   const tail = new Uint8Array(await response.arrayBuffer());
   if (!total || tail.length !== TRAILER || String.fromCharCode(...tail.subarray(8)) !== "GSSX") return plain();

@@ -198,7 +198,7 @@ export class LiveBuffer {
       return;
     }
     this.socket.stop();
-    this.stream.fail(new PacketError(sentence(error.message)));
+    this.stream.fail(new PacketError(error.message));
   }
 
   _timed() {

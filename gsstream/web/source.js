@@ -28,7 +28,7 @@ async function openManifest(url, signal) {
   try {
     manifest = JSON.parse(new TextDecoder().decode(data));
   } catch {
-    throw new SourceError(`${url} is no manifest of a stream.`);
+    throw new SourceError(`${url} is no manifest of a stream. Name a stream.json or a .gss file.`);
   }
   const version = /^gsstream (\d+)\.(\d+)$/.exec(manifest?.format ?? "");
   if (version && (Number(version[1]) !== FORMAT_MAJOR || Number(version[2]) > FORMAT_MINOR)) {

@@ -4,6 +4,7 @@
 import { KIND } from "./container.js";
 import { PacketBuffer } from "./buffer.js";
 import { Snapshots, decodePacket } from "./decode.js";
+import { forbidden } from "./download.js";
 import { PacketError } from "./errors.js";
 import { Packer } from "./packing.js";
 import { openSource } from "./source.js";
@@ -35,7 +36,7 @@ export class Stream {
 
   async open(number, url) {
     this.close();
-    this.number = number;
+    Object.assign(this, { number, url });
     const abort = new AbortController();
     this.abort = abort;
     try {
@@ -43,7 +44,8 @@ export class Stream {
       if (abort.signal.aborted) return;
       this.source = source;
     } catch (error) {
-      if (!abort.signal.aborted) this.fail(error);
+      const told = await forbidden(url, error).then(() => error, (reason) => reason);
+      if (!abort.signal.aborted) this.fail(told);
       return;
     }
     const { renditions, frames, poster, fps, live = false } = this.source;
@@ -116,7 +118,15 @@ export class Stream {
   fail(error) {
     const damaged = error instanceof PacketError;
     this.target = (damaged && this.playing ? this.buffer?.nextSegment(this.target) : null) ?? null;
-    this.say({ problem: error.message, kind: error.name, ended: this.target === null });
+    this.say({ problem: damaged ? this._told(error) : error.message, kind: error.name, ended: this.target === null });
+  }
+
+  /** What a PacketError means for who looks at the page, and what to do. */
+  _told({ message }) {
+    const { url } = this;
+    if (/^not a gsstream file/.test(message)) return `${url} is ${message}. Name a stream.json or a .gss file.`;
+    if (/newer|older|cannot be read|only gsstream play/.test(message)) return message.charAt(0).toUpperCase() + message.slice(1);
+    return `The stream is damaged: ${message}. Copy or export ${url} again.`;
   }
 
   /** Decode one packet, or begin where a join says. */

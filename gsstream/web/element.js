@@ -2,7 +2,8 @@
 //
 // Attributes: src, camera (id of a recorded camera), autoplay, loop ("false" plays once), speed, marks, statistics,
 // controls ("false" shows none), limits ("none" lets the view leave the recorded region), eager (takes the wheel and
-// fingers before a click or a tap), poster (a picture until the first one is drawn; that of a package needs none).
+// fingers before a click or a tap), poster (a picture until the first one is drawn; that of a package needs none),
+// xr ("vr" asks for a headset and says what is missing, "none" offers none).
 
 import { Controls } from "./controls.js";
 import { PAGE, PAUSE, PLAY, STYLE } from "./look.js";
@@ -113,6 +114,8 @@ export class PlayerElement extends HTMLElement {
     parts.marks.onclick = () => this._marks();
     parts.statistics.onclick = () => this._statistics();
     parts.full.onclick = () => this._full();
+    parts.headset.onclick = () => this._headset();
+    this._offer();
     parts.more.onclick = () => this._more();
     parts.canvas.addEventListener("pointerdown", () => this._more(false));
     this.addEventListener("focusin", () => this._wake());
@@ -202,6 +205,24 @@ export class PlayerElement extends HTMLElement {
     const { Statistics } = await import("./statistics.js");
     this.facts ??= new Statistics(this.player);
     this._everySecond();
+  }
+
+  /** A button for a headset only where there is one, or where only https is missing to whoever asks for it. */
+  async _offer() {
+    const wanted = this.getAttribute("xr");
+    const found = await globalThis.navigator.xr?.isSessionSupported("immersive-vr").catch(() => false);
+    this.parts.headset.hidden = wanted === "none" || !(found || (wanted === "vr" && !isSecureContext));
+  }
+
+  async _headset() {
+    if (!isSecureContext) {
+      this._tell("A headset needs a page with https. Serve this page by https, or open it at localhost.");
+      return;
+    }
+    const { Headset } = await import("./xr.js");
+    this.headset = new Headset(this.player);
+    this.headset.onEnd = () => this._say("The headset is left");
+    await this.headset.enter().catch((error) => this._tell(`The headset cannot be entered: ${error.message}`));
   }
 
   _full() {

@@ -9,6 +9,7 @@ const REPEAT = "M7 7h10v3l4-4-4-4v3H5v6h2zM17 17H7v-3l-4 4 4 4v-3h12v-6h-2z";
 const CHANGES = "M12 3a9 9 0 1 0 0 18 9 9 0 0 0 0-18zm0 2v14a7 7 0 0 1 0-14z";
 const DETAILS = "M12 3a9 9 0 1 0 0 18 9 9 0 0 0 0-18zm0 2a7 7 0 1 1 0 14 7 7 0 0 1 0-14zm-1 2h2v2h-2zm0 4h2v6h-2z";
 const FULL = "M4 4h6v2H6v4H4zM14 4h6v6h-2V6h-4zM4 14h2v4h4v2H4zM18 14h2v6h-6v-2h4z";
+const HEADSET = "M3 7h18v10h-6l-3-3-3 3H3zM7 10v4h3v-4zM14 10v4h3v-4z";
 const MORE = "M4 10h4v4H4zM10 10h4v4h-4zM16 10h4v4h-4z";
 
 export const STYLE = `
@@ -94,6 +95,7 @@ export const PAGE = `
     <label title="Other streams of the recording"><span>Quality</span><select class="rendition" hidden></select></label>
     <button class="marks moving" title="Mark what the frame changed (g)">${icon(CHANGES)}<span>Changes</span></button>
     <button class="statistics" title="Sizes and rates (i)">${icon(DETAILS)}<span>Details</span></button>
+    <button class="headset" title="Look with a headset" hidden>${icon(HEADSET)}<span>Headset</span></button>
     <button class="full" title="Full screen (f)">${icon(FULL)}<span>Full screen</span></button>
   </div>
   <button class="more" title="More (Escape closes)" aria-label="More" aria-expanded="false">${icon(MORE)}</button>

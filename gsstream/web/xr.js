@@ -1,0 +1,187 @@
+// A headset looks into a stream: two eyes, one depth order, one decoding. Only who enters one loads this.
+
+import { add, cross, dot, pivotOf, unit } from "./camera.js";
+import { outside } from "./region.js";
+
+/** Where eyes are above the floor, and how far away the middle of a scene is whose metres nobody knows. */
+const [EYES, AWAY] = [1.6, 2];
+/** What is left of the picture where no camera looked: the head is never pushed back. */
+const LEFT = 0.15;
+/** The least share of a window's side that is drawn where pictures come late. */
+const SMALLEST = 0.6;
+
+/**
+ * The camera (see Renderer) of an XRView: `place` `{ rotation (9, row by row), offset (3), scale }` takes the stream to
+ * the space of the session; `recorded` is a view of the recording.
+ */
+export function cameraOfView(view, { width, height }, place, recorded) {
+  const m = view.transform.inverse.matrix; // column by column; x right, y up, z back
+  const columns = [0, 1, 2].map((k) => [0, 3, 6].map((row) => place.rotation[row + k]));
+  const rows = [0, 1, 2].map((i) => {
+    const sign = i ? -1 : 1;
+    const line = [m[i], m[4 + i], m[8 + i]].map((v) => sign * v);
+    return [...columns.map((column) => dot(line, column)), (dot(line, place.offset) + sign * m[12 + i]) / place.scale];
+  });
+  const p = view.projectionMatrix;
+  const fx = (p[0] * width) / 2;
+  return {
+    viewmat: [...rows.flat(), 0, 0, 0, 1],
+    near: Math.max(recorded.near, 0.05 / place.scale),
+    scale: fx / recorded.fx,
+    width,
+    height,
+    fx,
+    fy: (p[5] * height) / 2,
+    cx: (width / 2) * (1 - p[8]),
+    cy: (height / 2) * (1 + p[9]),
+  };
+}
+
+/** Stand where a camera of the recording stands, looking level; `metres` for one unit of the stream. */
+export function placeAt(view, up, metres) {
+  const back = unit(add(view.forward, up, -dot(view.forward, up)).map((v) => -v));
+  const rotation = [...cross(up, back), ...up, ...back];
+  const offset = [0, 3, 6].map((row) => -metres * dot(rotation.slice(row, row + 3), view.eye));
+  return { rotation, offset: add(offset, [0, EYES, 0]), scale: metres };
+}
+
+/** A place moved so that what hands held at points `from` is where they are, `to`: one hand moves, two turn and scale. */
+export function grabbed(place, from, to) {
+  const middle = (points) => points.reduce((sum, point) => add(sum, point, 1 / points.length), [0, 0, 0]);
+  const arm = ([a, b]) => (b ? add(b, a, -1) : [1, 0, 0]);
+  const [before, after] = [arm(from), arm(to)];
+  const factor = Math.hypot(...after) / (Math.hypot(...before) || 1) || 1;
+  const angle = Math.atan2(before[2], before[0]) - Math.atan2(after[2], after[0]);
+  const [c, s] = [Math.cos(angle), Math.sin(angle)];
+  const turned = ([x, y, z]) => [c * x + s * z, y, c * z - s * x];
+  const [zero, one, two] = [0, 3, 6].map((row) => place.rotation.slice(row, row + 3));
+  const mixed = (a, b) => zero.map((v, i) => a * v + b * two[i]);
+  const offset = turned(add(place.offset, middle(from), -1)).map((v) => v * factor);
+  return {
+    rotation: [...mixed(c, s), ...one, ...mixed(-s, c)],
+    offset: add(offset, middle(to)),
+    scale: place.scale * factor,
+  };
+}
+
+/** Shows what a player plays in a headset, from `enter` until the session ends. */
+export class Headset {
+  constructor(player) {
+    Object.assign(this, { player, session: null, pictures: 0, cameras: [], held: new Map(), share: 1, exact: false });
+  }
+
+  /** Begin; call it from a click. Rejects with the browser's Error where it does not let the page in. */
+  async enter() {
+    const { player } = this;
+    const { gl, canvas } = player.renderer;
+    const session = await navigator.xr.requestSession("immersive-vr", { requiredFeatures: ["local-floor"] });
+    this.session = session;
+    session.addEventListener("end", () => this._ended());
+    this.lost = () => session.end().catch(() => {});
+    canvas.addEventListener("webglcontextlost", this.lost);
+    try {
+      await gl.makeXRCompatible?.();
+      this.layer = new XRWebGLLayer(session, gl, { antialias: false, depth: false });
+      if ("fixedFoveation" in this.layer) this.layer.fixedFoveation = 1;
+      session.updateRenderState({ baseLayer: this.layer });
+      this.space = await session.requestReferenceSpace("local-floor");
+    } catch (error) {
+      this.lost();
+      throw error;
+    }
+    const pivot = pivotOf(player.views);
+    const distance = Math.hypot(...add(player.view.eye, pivot.point, -1));
+    this.place = placeAt(player.view, pivot.up, player.state.meta.metres ?? AWAY / (distance || 1));
+    for (const name of ["selectstart", "squeezestart"]) {
+      session.addEventListener(name, ({ inputSource }) => this.held.set(inputSource, null));
+    }
+    for (const name of ["selectend", "squeezeend"]) {
+      session.addEventListener(name, ({ inputSource }) => this.held.delete(inputSource));
+    }
+    player.driver = this;
+    session.requestAnimationFrame((time, frame) => this._turn(time, frame));
+  }
+
+  leave() {
+    return this.session?.end();
+  }
+
+  _ended() {
+    this.player.renderer.canvas.removeEventListener("webglcontextlost", this.lost);
+    this.session = null;
+    if (this.player.driver === this) this.player.driver = null;
+    this.player.invalidate();
+    this.onEnd?.();
+  }
+
+  _turn(time, frame) {
+    if (!this.session) return;
+    this.session.requestAnimationFrame((next, after) => this._turn(next, after));
+    const { player, layer } = this;
+    player.turn(time);
+    const pose = frame.getViewerPose(this.space);
+    if (!pose || !player.state || player.renderer.gl.isContextLost()) return;
+    this._pace(time);
+    this._grab(frame);
+    // A device may have one eye only: the window of the other has no size.
+    const seen = pose.views.map((view) => {
+      view.requestViewportScale?.(this.share);
+      const { x, y, width, height } = layer.getViewport(view);
+      const camera = cameraOfView(view, { width, height }, this.place, player.view);
+      return { eye: view.eye, window: { framebuffer: layer.framebuffer, x, y, width, height }, camera };
+    });
+    this.cameras = seen.filter(({ window }) => window.width);
+    this._draw(pose.transform);
+    this.pictures += 1;
+    this.time = time;
+    this.onPicture?.(this);
+  }
+
+  _draw(head) {
+    const { player, cameras } = this;
+    const { renderer } = player;
+    if (!cameras.length) return;
+    // One order for both eyes, of the first: they stand six centimetres apart. It may be late, and is not waited for.
+    if (!renderer.prepare(cameras[0].camera, this.exact || !renderer.sorter.order.length)) return;
+    const shown = 1 - (1 - LEFT) * this._outside(head);
+    for (const { camera, window } of cameras) renderer.paint(camera, window, shown);
+    player.shown();
+  }
+
+  /** How far the head is from where cameras stood. */
+  _outside({ position }) {
+    const { rotation, offset, scale } = this.place;
+    const { region, view, pivot } = this.player;
+    if (!region) return 0;
+    const away = [position.x - offset[0], position.y - offset[1], position.z - offset[2]].map((v) => v / scale);
+    const eye = [0, 1, 2].map((k) => rotation[k] * away[0] + rotation[3 + k] * away[1] + rotation[6 + k] * away[2]);
+    return outside(region, { ...view, eye }, pivot);
+  }
+
+  /** Smaller windows where pictures come late, larger ones again where they do not. */
+  _pace(time) {
+    const wanted = 1000 / (this.session.frameRate || 72);
+    if (this.time) this.share += time - this.time > 1.5 * wanted ? -0.02 : 0.002;
+    this.share = Math.min(1, Math.max(SMALLEST, this.share));
+  }
+
+  /** What hands hold moves with them. */
+  _grab(frame) {
+    const pairs = [];
+    for (const [source, before] of this.held) {
+      const pose = frame.getPose(source.gripSpace ?? source.targetRaySpace, this.space);
+      if (!pose) continue;
+      const { x, y, z } = pose.transform.position;
+      if (before) pairs.push([before, [x, y, z]]);
+      this.held.set(source, [x, y, z]);
+    }
+    const used = pairs.slice(0, 2);
+    if (used.length) {
+      this.place = grabbed(
+        this.place,
+        used.map(([from]) => from),
+        used.map(([, to]) => to),
+      );
+    }
+  }
+}

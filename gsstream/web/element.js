@@ -215,14 +215,9 @@ export class PlayerElement extends HTMLElement {
   }
 
   async _headset() {
-    if (!isSecureContext) {
-      this._tell("A headset needs a page with https. Serve this page by https, or open it at localhost.");
-      return;
-    }
     const { Headset } = await import("./xr.js");
     this.headset = new Headset(this.player);
-    this.headset.onEnd = () => this._say("The headset is left");
-    await this.headset.enter().catch((error) => this._tell(`The headset cannot be entered: ${error.message}`));
+    await this.headset.enter().catch((error) => this._tell(error.message));
   }
 
   _full() {
@@ -303,7 +298,6 @@ export class PlayerElement extends HTMLElement {
       ArrowUp: () => controls.turn(0, -TURN),
       ArrowDown: () => controls.turn(0, TURN),
       "+": () => controls.turn(0, 0, 1 / ZOOM),
-      "=": () => controls.turn(0, 0, 1 / ZOOM),
       "-": () => controls.turn(0, 0, ZOOM),
       ".": () => step(1),
       ",": () => step(-1),

@@ -1,7 +1,7 @@
 // The depth order of what is drawn, from a worker where there is one. At most one request is under way.
 
 import { DepthSorter } from "./sorting.js";
-import { startWorker } from "./workers.js";
+import { startWorker } from "./stream-link.js";
 
 /** Hands positions to the sorter and keeps its last answer in `order`. */
 export class SortQueue {

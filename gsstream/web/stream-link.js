@@ -1,7 +1,5 @@
 // The page's end of a stream that is loaded and decoded elsewhere: in a worker, or in slices on this thread.
 
-import { startWorker } from "./workers.js";
-
 /** Milliseconds of decoding on the page's own thread, after which the page gets its turn. */
 const SLICE = 8;
 
@@ -56,5 +54,18 @@ export class StreamLink {
       for (const message of this.sent) this.stream.hear(message);
       this.sent = null;
     });
+  }
+}
+
+/** A module of the player as a Worker, or null where the page may have none. */
+export function startWorker(name) {
+  const url = new URL(name, import.meta.url);
+  // The player may lie elsewhere; a worker must be the page's own, and one line that imports the module is.
+  const own = url.origin === globalThis.location?.origin;
+  const line = () => URL.createObjectURL(new Blob([`import ${JSON.stringify(url.href)};`], { type: "text/javascript" }));
+  try {
+    return new Worker(own ? url : line(), { type: "module" });
+  } catch {
+    return null;
   }
 }

@@ -70,11 +70,17 @@ export class Headset {
     Object.assign(this, { player, session: null, pictures: 0, cameras: [], held: new Map(), share: 1, exact: false });
   }
 
-  /** Begin; call it from a click. Rejects with the browser's Error where it does not let the page in. */
+  /** Begin; call it from a click. Rejects with an Error of one sentence where the page is not let in. */
   async enter() {
+    if (!isSecureContext) {
+      throw new Error("A headset needs a page with https. Serve this page by https, or open it at localhost.");
+    }
     const { player } = this;
     const { gl, canvas } = player.renderer;
-    const session = await navigator.xr.requestSession("immersive-vr", { requiredFeatures: ["local-floor"] });
+    const wanted = { requiredFeatures: ["local-floor"] };
+    const session = await navigator.xr.requestSession("immersive-vr", wanted).catch((error) => {
+      throw new Error(`The headset cannot be entered: ${error.message}`);
+    });
     this.session = session;
     session.addEventListener("end", () => this._ended());
     this.lost = () => session.end().catch(() => {});
@@ -111,7 +117,6 @@ export class Headset {
     this.session = null;
     if (this.player.driver === this) this.player.driver = null;
     this.player.invalidate();
-    this.onEnd?.();
   }
 
   _turn(time, frame) {

@@ -203,7 +203,7 @@ def test_offline_is_said(site, tmp_path):
 @needs_node
 def test_reasons_differ(tmp_path):
     code = """
-    const { reasonOf } = await load('reasons.js');
+    const { reasonOf } = await load('download.js');
     const fail = () => { throw new TypeError(); };
     const found = [];
     for (const [url, origin, onLine, answers] of given)

@@ -42,12 +42,6 @@ from gsstream.parts.motion.fitting import groupwise_max as groupwise_max
 from gsstream.parts.motion.fitting import narrow_to as narrow_to
 from gsstream.parts.motion.groups import groups_of_rows as groups_of_rows
 from gsstream.parts.motion.groups import pixel_size as pixel_size
-from gsstream.parts.optimiser.joint import add_joint as add_joint
-from gsstream.parts.optimiser.joint import decode_joint as decode_joint
-from gsstream.parts.optimiser.joint import join_features as join_features
-from gsstream.parts.optimiser.joint import joint_vjp as joint_vjp
-from gsstream.parts.optimiser.rate import rate_gradient as rate_gradient
-from gsstream.parts.optimiser.row_parameters import RowParameters as RowParameters
 from gsstream.parts.render.activations import activate_opacities as activate_opacities
 from gsstream.parts.render.activations import activate_scales as activate_scales
 from gsstream.parts.render.activations import logit as logit
@@ -55,6 +49,12 @@ from gsstream.parts.render.activations import rgb_to_sh0 as rgb_to_sh0
 from gsstream.parts.render.activations import rotation_matrices as rotation_matrices
 from gsstream.parts.render.backward import backward as backward
 from gsstream.parts.render.backward import rows_backward as rows_backward
+from gsstream.parts.residual.decode import add_joint as add_joint
+from gsstream.parts.residual.decode import decode_joint as decode_joint
+from gsstream.parts.residual.decode import join_features as join_features
+from gsstream.parts.residual.decode import joint_vjp as joint_vjp
+from gsstream.parts.residual.layout import JointLayout as JointLayout
+from gsstream.parts.residual.layout import joint_layout as joint_layout
+from gsstream.parts.residual.rate import rate_gradient as rate_gradient
+from gsstream.parts.residual.row_parameters import RowParameters as RowParameters
 from gsstream.parts.update.base import MAX_SYMBOL as MAX_SYMBOL
-from gsstream.parts.update.joint import JointLayout as JointLayout
-from gsstream.parts.update.joint import joint_layout as joint_layout

@@ -1,4 +1,4 @@
-"""The residual of one attribute after the other, differentiated by autograd: an oracle for ``optimiser.joint``.
+"""An oracle for ``gsstream.parts.residual.decode``: the residual attribute by attribute, differentiated by autograd.
 
 ``train_rows`` calls the joint table the way the engine does, with the oracle's arguments.
 """
@@ -11,9 +11,9 @@ from typing import NamedTuple
 import torch
 
 from gsstream.core.gaussians import Gaussians
-from gsstream.parts.optimiser.joint import JointResidual, add_joint, decode_joint, join_features
+from gsstream.parts.residual.decode import JointResidual, add_joint, decode_joint, join_features
+from gsstream.parts.residual.layout import JointLayout, joint_layout
 from gsstream.parts.update.base import UpdateRule
-from gsstream.parts.update.joint import JointLayout, joint_layout
 
 
 def quantise(latents: torch.Tensor, step: float) -> torch.Tensor:

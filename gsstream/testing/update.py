@@ -11,9 +11,9 @@ from gsstream.core.changes import Layout, Residual, apply_residual, sent_rows
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.packet import quantise_decoders
 from gsstream.packet.base import MAX_CHANNELS
-from gsstream.parts.optimiser.joint import add_joint, decode_joint, join_features
+from gsstream.parts.residual.decode import add_joint, decode_joint, join_features
+from gsstream.parts.residual.layout import joint_layout
 from gsstream.parts.update.base import UpdateRule, init_latents, quantise_latents
-from gsstream.parts.update.joint import joint_layout
 from gsstream.testing.cases import fingerprint, get_case
 from gsstream.testing.compare import equal
 from gsstream.testing.registry import check

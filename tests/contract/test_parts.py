@@ -24,11 +24,11 @@ from gsstream.api import (
 )
 from gsstream.parts.confidence.uniform import Uniform
 from gsstream.parts.gate.always_open import AlwaysOpen
-from gsstream.parts.optimiser.joint import add_joint, decode_joint, join_features, joint_vjp
 from gsstream.parts.propagation.group_max import GroupMax
+from gsstream.parts.residual.decode import add_joint, decode_joint, join_features, joint_vjp
+from gsstream.parts.residual.layout import AttributeCode, joint_layout
 from gsstream.parts.update.additive import Additive, DirectCode
-from gsstream.parts.update.base import AttributeCode, UpdateRule, init_latents, quantise_latents
-from gsstream.parts.update.joint import joint_layout
+from gsstream.parts.update.base import UpdateRule, init_latents, quantise_latents
 from tests.scenes import make_scene
 
 

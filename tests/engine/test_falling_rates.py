@@ -16,9 +16,9 @@ from gsstream_cpu_render.residual import CpuResidualOptimiser
 from gsstream.engine.step.optimise import lr_factor
 from gsstream.packet import StreamReader
 from gsstream.parts.optimiser.adam import ReferenceAdam
-from gsstream.parts.optimiser.base import AdamState
-from gsstream.parts.optimiser.joint import JointResidualOptimiser
-from gsstream.parts.optimiser.residual import ResidualOptimiser
+from gsstream.parts.residual.adam_state import AdamState
+from gsstream.parts.residual.optimiser import ResidualOptimiser
+from gsstream.parts.residual.reference import JointResidualOptimiser
 from gsstream.testing.optimiser.checks import residual_case
 
 FACTORS = (1.0, 0.5, 0.01)

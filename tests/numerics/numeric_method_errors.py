@@ -25,9 +25,10 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.packet.grids import KEY_BITS, from_codes, to_codes
 from gsstream.packet.symbols import decode_symbols, encode_symbols
 from gsstream.parts.optimiser.adam import ReferenceAdam
-from gsstream.parts.optimiser.base import ADAM_BETAS, ADAM_EPS, AdamState, RowOptimiser
-from gsstream.parts.optimiser.rate import channel_spread, laplace_gradient
+from gsstream.parts.optimiser.base import RowOptimiser
 from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.parts.residual.adam_state import ADAM_BETAS, ADAM_EPS, AdamState
+from gsstream.parts.residual.rate import channel_spread, laplace_gradient
 from gsstream.parts.update.base import init_latents
 
 Measure = Callable[[int], float]

@@ -25,7 +25,8 @@ from gsstream.engine.step.optimise import _Fit
 from gsstream.input.recordings.open import open_source
 from gsstream.metrics import psnr
 from gsstream.parts.optimiser.adam import ReferenceAdam
-from gsstream.parts.optimiser.base import MAX_GRADIENT, AdamState, RowOptimiser
+from gsstream.parts.optimiser.base import RowOptimiser
+from gsstream.parts.residual.adam_state import MAX_GRADIENT, AdamState
 from gsstream.testing.streaming_method import SOURCE, MethodUnderTest
 
 

@@ -18,8 +18,8 @@ from gsstream.engine.assembly.checks import Checks, Look
 from gsstream.engine.assembly.fault import Where, fault
 from gsstream.engine.assembly.output_checks import OUTPUT_CHECKS
 from gsstream.parts.optimiser.base import RowOptimiser
-from gsstream.parts.optimiser.residual import ResidualOptimiser
 from gsstream.parts.render.base import RenderSession
+from gsstream.parts.residual.optimiser import ResidualOptimiser
 
 T = TypeVar("T")
 #: The names under which the table below and that of the checks list what parts open: sessions of a renderer, residuals

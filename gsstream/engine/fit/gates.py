@@ -7,10 +7,10 @@ import torch
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.parts.gate.base import GateSampler
 from gsstream.parts.optimiser.base import RowOptimiser
-from gsstream.parts.optimiser.row_parameters import RowParameters
-from gsstream.parts.optimiser.state import AdamState
 from gsstream.parts.regularizer.base import Regularizer
 from gsstream.parts.render.backward import backward
+from gsstream.parts.residual.adam_state import AdamState
+from gsstream.parts.residual.row_parameters import RowParameters
 
 
 class TrainedGates:

@@ -33,10 +33,10 @@ from gsstream.engine.frame0.pyramid import Pyramid, PyramidLevel, keep_widths, p
 from gsstream.engine.frame0.regularisers import Dropout, choose_regularisers
 from gsstream.engine.frame0.smooth_depth import SmoothDepth
 from gsstream.input.seeds.shell import find_shell
-from gsstream.parts.optimiser.row_parameters import RowParameters, TopologyEdit
 from gsstream.parts.render.activations import logit, rgb_to_sh0
 from gsstream.parts.render.exposure import Exposure
 from gsstream.parts.render.wrt import LossAndGrad, WrtScene
+from gsstream.parts.residual.row_parameters import RowParameters, TopologyEdit
 from gsstream.parts.structure.base import Anchors
 from gsstream.recipe.model import FirstFrame
 

@@ -35,9 +35,9 @@ from gsstream.engine.fit.gates import TrainedGates
 from gsstream.engine.step.active.candidates import keep_mask
 from gsstream.engine.step.problem import Problem, Solution
 from gsstream.parts.gate.base import GateSampler
-from gsstream.parts.optimiser.residual import Iteration, ResidualEpoch
+from gsstream.parts.residual.layout import joint_layout
+from gsstream.parts.residual.optimiser import Iteration, ResidualEpoch
 from gsstream.parts.update.base import init_latents, scale_steps
-from gsstream.parts.update.joint import joint_layout
 from gsstream.recipe.model import Stream
 
 #: Rows leave only when at least a tenth of them can: each time, every view has to be frozen anew.

@@ -11,7 +11,8 @@ import torch
 from gsstream.core.deferred import require
 from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import check_finite, check_shape
-from gsstream.parts.optimiser.base import ADAM_BETAS, ADAM_EPS, MAX_GRADIENT, AdamState, RowOptimiser
+from gsstream.parts.optimiser.base import RowOptimiser
+from gsstream.parts.residual.adam_state import ADAM_BETAS, ADAM_EPS, MAX_GRADIENT, AdamState
 
 #: Number of steps from which on both corrections are 1 in float32.
 SATURATED = 1 << 15

@@ -8,14 +8,11 @@ from collections.abc import Mapping
 import torch
 
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.joint import JointLayout
 from gsstream.core.part import Part
-from gsstream.parts.optimiser.joint import JointResidualOptimiser
-from gsstream.parts.optimiser.residual import ResidualOptimiser
-from gsstream.parts.optimiser.state import ADAM_BETAS as ADAM_BETAS
-from gsstream.parts.optimiser.state import ADAM_EPS as ADAM_EPS
-from gsstream.parts.optimiser.state import MAX_GRADIENT as MAX_GRADIENT
-from gsstream.parts.optimiser.state import AdamState as AdamState
+from gsstream.parts.residual.adam_state import AdamState
+from gsstream.parts.residual.layout import JointLayout
+from gsstream.parts.residual.optimiser import ResidualOptimiser
+from gsstream.parts.residual.reference import JointResidualOptimiser
 
 
 class RowOptimiser(Part):

@@ -9,7 +9,8 @@ from pydantic import Field
 
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.part import PartConfig
-from gsstream.parts.update.base import AttributeCode, Scope, UpdateRule
+from gsstream.parts.residual.layout import AttributeCode
+from gsstream.parts.update.base import Scope, UpdateRule
 
 
 class DirectCode(PartConfig):

@@ -1,15 +1,15 @@
 """UpdateRule: which attributes change, in which latent space, at which quantisation step.
 
-The interface may change with a minor version. Training applies a residual by ``optimiser.joint`` (torch, with its
-gradient written out), encoder and player by ``core.changes.apply_residual`` (numpy, from the integers that are sent);
-``check_update_closed_loop`` of the contract kit compares the two.
+The interface may change with a minor version. Training applies a residual by ``gsstream.parts.residual.decode``
+(torch, with its gradient written out), encoder and player by ``core.changes.apply_residual`` (numpy, from the integers
+that are sent); ``check_update_closed_loop`` of the contract kit compares the two.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
 
 import torch
@@ -17,6 +17,7 @@ import torch
 from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.part import Part
+from gsstream.parts.residual.layout import AttributeCode
 
 #: Largest magnitude of a symbol: up to it float32, in which symbols are decoded, represents every integer exactly.
 MAX_SYMBOL = 1 << 24
@@ -28,25 +29,6 @@ class Scope(Enum):
     NONE = "none"
     CHANGED = "changed"
     ALL = "all"
-
-
-@dataclass(frozen=True, slots=True)
-class AttributeCode:
-    """How the residual of one attribute is represented.
-
-    Arguments:
-        step: quantisation step in latent units (position: fraction of the Gaussian's unit).
-        lr: Adam learning rate of the latents, latent units per iteration.
-        latent: number of latent channels; 0 means identity (one latent per feature, no decoder).
-        decoder_lr: Adam learning rate of the linear decoder.
-        decoder_std: standard deviation of the decoder's initial entries.
-    """
-
-    step: float
-    lr: float
-    latent: int = 0
-    decoder_lr: float = 0.0
-    decoder_std: float = 0.0
 
 
 class UpdateRule(Part):

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import final
 
-from gsstream.parts.update.base import AttributeCode, Scope, UpdateRule
+from gsstream.parts.residual.layout import AttributeCode
+from gsstream.parts.update.base import Scope, UpdateRule
 
 
 @final

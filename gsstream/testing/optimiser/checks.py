@@ -6,15 +6,14 @@ import torch
 
 from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.joint import JointLayout
 from gsstream.engine.fit.gates import TrainedGates
 from gsstream.parts.loss.photometric import ReferenceLoss
-from gsstream.parts.optimiser.base import ADAM_BETAS, ADAM_EPS, AdamState, RowOptimiser
-from gsstream.parts.optimiser.joint import JointResidualOptimiser
-from gsstream.parts.optimiser.residual import Iteration, ResidualEpoch, ResidualOptimiser
+from gsstream.parts.optimiser.base import RowOptimiser
 from gsstream.parts.render.target import ViewTarget
-from gsstream.parts.update.base import AttributeCode
-from gsstream.parts.update.joint import joint_layout
+from gsstream.parts.residual.adam_state import ADAM_BETAS, ADAM_EPS, AdamState
+from gsstream.parts.residual.layout import AttributeCode, JointLayout, joint_layout
+from gsstream.parts.residual.optimiser import Iteration, ResidualEpoch, ResidualOptimiser
+from gsstream.parts.residual.reference import JointResidualOptimiser
 from gsstream.testing.cases import BLACK, RENDERER, get_case
 from gsstream.testing.compare import equal
 from gsstream.testing.examples.gate import ExampleGate

@@ -24,7 +24,7 @@ from gsstream.engine.step import frame_step
 from gsstream.input.recordings.open import open_source
 from gsstream.parts.loss.photometric import ReferenceLoss
 from gsstream.parts.motion.newton import DampedNewton
-from gsstream.parts.optimiser.joint import JointResidualOptimiser
+from gsstream.parts.residual.reference import JointResidualOptimiser
 from gsstream.testing.method_driver import SOURCE
 from gsstream.testing.pretend import PretendDevice
 

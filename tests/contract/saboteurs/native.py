@@ -8,12 +8,11 @@ from typing import Any
 
 import torch
 
-from gsstream.core.joint import JointLayout
 from gsstream.parts.loss.base import LossTraits
 from gsstream.parts.optimiser.adam import ReferenceAdam
-from gsstream.parts.optimiser.joint import JointResidualOptimiser
-from gsstream.parts.optimiser.residual import ResidualEpoch, ResidualOptimiser
-from gsstream.parts.update.base import AttributeCode
+from gsstream.parts.residual.layout import AttributeCode, JointLayout
+from gsstream.parts.residual.optimiser import ResidualEpoch, ResidualOptimiser
+from gsstream.parts.residual.reference import JointResidualOptimiser
 from gsstream.testing.examples.update import ExampleUpdate
 from gsstream.testing.loss.example import ExampleLoss
 from saboteurs.register import spoils

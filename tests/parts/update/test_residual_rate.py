@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsstream.packet.symbols import encode_symbols
-from gsstream.parts.optimiser.rate import MIN_SPREAD, channel_spread, laplace_bits, laplace_gradient, rate_gradient
+from gsstream.parts.residual.rate import MIN_SPREAD, channel_spread, laplace_bits, laplace_gradient, rate_gradient
 
 SEEDS = st.integers(0, 2**32 - 1)
 

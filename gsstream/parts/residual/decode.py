@@ -1,22 +1,16 @@
-"""The residual of all attributes side by side, as one table: a few large operations instead of many small ones.
+"""From latents to attributes: what a residual decodes to, and the gradient of that map.
 
-Latents of all attributes are the columns of one [A, L] table, their decoders the blocks of one [L, D] matrix (identity
-where an attribute has no decoder), what changes the columns of one [A, D] table. The map is that of
-:func:`gsstream.core.changes.apply_delta`, up to rounding.
+The map is that of :func:`gsstream.core.changes.apply_delta`, up to rounding, for all attributes at once.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import torch
 
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.joint import JointLayout
-from gsstream.parts.optimiser.rate import rate_gradient
-from gsstream.parts.optimiser.residual import ResidualOptimiser
-from gsstream.parts.optimiser.row_parameters import RowParameters
-from gsstream.parts.optimiser.state import RowSteps
+from gsstream.parts.residual.layout import JointLayout
 
 
 def join_features(code: JointLayout, rows: Gaussians[torch.Tensor]) -> torch.Tensor:
@@ -100,60 +94,3 @@ def joint_vjp(
     if "means" in code.feature:
         gated[:, code.feature["means"]] *= units[:, None]
     return JointGrad(gated @ matrix.T, (change.latents.T @ gated).mul_(code.trained), by_gate)
-
-
-@final
-class JointResidualOptimiser(ResidualOptimiser):
-    """Calls the functions above, the rate's gradient and the optimiser's ``step``: the reference for faster ones."""
-
-    def __init__(
-        self,
-        code: JointLayout,
-        base: Gaussians[torch.Tensor],
-        units: torch.Tensor,
-        matrix: torch.Tensor,
-        optimiser: RowSteps,
-    ) -> None:
-        self._code, self._base, self._units = code, base, units
-        self._features = join_features(code, base)
-        start = base.means.new_zeros(len(base), code.width)
-        self._latents = RowParameters({"latents": start}, {"latents": code.lrs}, optimiser)
-        self._decoders = RowParameters({"matrix": matrix}, {"matrix": code.decoder_lrs}, optimiser)
-
-    @property
-    def latents(self) -> torch.Tensor:
-        return self._latents["latents"]
-
-    @property
-    def position(self) -> torch.Tensor:
-        columns = self._code.latent.get("means")
-        return self._features.new_zeros(len(self._base), 3) if columns is None else self.latents[:, columns]
-
-    @property
-    def matrix(self) -> torch.Tensor:
-        return self._decoders["matrix"].detach()
-
-    @property
-    def curvature(self) -> torch.Tensor:
-        return self._latents.moments("latents")["exp_avg_sq"]
-
-    def forward(self, gates: torch.Tensor) -> Gaussians[torch.Tensor]:
-        self._gates = gates
-        self._change = decode_joint(self._code, self.latents.detach(), self.matrix, self._units)
-        return add_joint(self._code, self._base, self._features, change=self._change, gates=gates)
-
-    def backward(self, grad: Gaussians[torch.Tensor], rd_lambda: float) -> torch.Tensor:
-        upstream = join_features(self._code, grad)
-        back = joint_vjp(self._code, upstream, self._change, matrix=self.matrix, gates=self._gates, units=self._units)
-        if rd_lambda:
-            back.latents.add_(rate_gradient(self.latents.detach(), self._code.steps, self._gates, rd_lambda))
-        self._grad = back
-        return back.gates
-
-    def step(self, lr_factor: float = 1.0) -> None:
-        self._latents.step({"latents": self._grad.latents}, lr_factor)
-        self._decoders.step({"matrix": self._grad.matrix}, lr_factor)
-
-    def select_rows(self, rows: torch.Tensor) -> None:
-        self._latents.select_rows(rows)
-        self._base, self._features, self._units = self._base.rows(rows), self._features[rows], self._units[rows]

@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 import torch
 
-from gsstream.parts.optimiser.state import AdamState, RowSteps
+from gsstream.parts.residual.adam_state import AdamState, RowSteps
 
 
 @dataclass(frozen=True, slots=True)

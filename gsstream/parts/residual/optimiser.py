@@ -10,10 +10,10 @@ from typing import Any, NamedTuple, Protocol, final
 import torch
 
 from gsstream.core.gaussians import Gaussians
-from gsstream.parts.optimiser.state import AdamState
 from gsstream.parts.render.session import RenderSession
 from gsstream.parts.render.target import ViewTarget
 from gsstream.parts.render.wrt import WrtRows
+from gsstream.parts.residual.adam_state import AdamState
 
 
 class Gates(Protocol):
@@ -100,8 +100,8 @@ class ResidualEpoch:
 class ResidualOptimiser(ABC):
     """The residual of A rows in one frame's optimisation: latents behind linear decoders, gated, trained by Adam.
 
-    It is ``gsstream.parts.optimiser.joint`` (rounding counts as the identity), the rate of
-    ``gsstream.parts.optimiser.rate`` and ``RowOptimiser.step``, up to rounding. In every iteration ``forward``,
+    It is ``gsstream.parts.residual.decode`` (rounding counts as the identity), the rate of
+    ``gsstream.parts.residual.rate`` and ``RowOptimiser.step``, up to rounding. In every iteration ``forward``,
     ``backward`` and ``step`` are called in this order.
     """
 

@@ -1,8 +1,8 @@
 """gsstream: online free-viewpoint video as a stream of 3D Gaussians.
 
 Importing this package is cheap: it imports neither torch nor a plugin. Its front doors are imported when they are
-named: ``gsstream.encode`` and ``gsstream.play`` for scripts; ``gsstream.api``, ``gsstream.blocks``, ``gsstream.spec``
-and ``gsstream.testing`` for plugins.
+named: ``gsstream.encode`` and ``gsstream.play`` for scripts; ``gsstream.api``, ``gsstream.backend``,
+``gsstream.blocks``, ``gsstream.spec`` and ``gsstream.testing`` for plugins.
 """
 
 import importlib
@@ -16,7 +16,7 @@ __version__ = "0.1.0"
 #: Another major is refused, a newer minor is refused with "upgrade gsstream", an older minor is fine.
 API_VERSION = "3.0"
 
-_DOORS = ("api", "blocks", "encode", "play", "spec", "testing")
+_DOORS = ("api", "backend", "blocks", "encode", "play", "spec", "testing")
 
 
 if not TYPE_CHECKING:  # or else checkers of types take any name for one of this module

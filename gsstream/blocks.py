@@ -6,10 +6,6 @@ copy: densify, count changed tiles, learn residuals side by side, weigh their ra
 
 from gsstream.core.changes.motion import GroupTransforms as GroupTransforms
 from gsstream.core.changes.motion import predict_transforms as predict_transforms
-from gsstream.core.changes.motion import quat_multiply as quat_multiply
-from gsstream.core.changes.motion import quat_to_rotmat as quat_to_rotmat
-from gsstream.core.changes.motion import rodrigues_to_quat as rodrigues_to_quat
-from gsstream.core.changes.motion import transform_groups as transform_groups
 from gsstream.core.changes.rows import gather_rows as gather_rows
 from gsstream.core.picture_size import bit_price_factor as bit_price_factor
 from gsstream.core.picture_size import enlargement as enlargement
@@ -19,11 +15,7 @@ from gsstream.engine.fit.densify import split_or_clone as split_or_clone
 from gsstream.engine.fit.nearest import k_nearest as k_nearest
 from gsstream.engine.fit.nearest import nearest_rows as nearest_rows
 from gsstream.engine.fit.nearest import neighbour_distance as neighbour_distance
-from gsstream.engine.step.active.candidates import changed_rows as changed_rows
-from gsstream.engine.step.active.change import Change as Change
 from gsstream.engine.step.active.change import count_per_tile as count_per_tile
-from gsstream.engine.step.active.change import detect_changed_tiles as detect_changed_tiles
-from gsstream.engine.step.quantise import gather_rows_or_zero as gather_rows_or_zero
 from gsstream.parts.growth.copying import CopyFilter as CopyFilter
 from gsstream.parts.growth.copying import CopySettings as CopySettings
 from gsstream.parts.growth.copying import high_gradient_rows as high_gradient_rows
@@ -42,19 +34,6 @@ from gsstream.parts.motion.fitting import groupwise_max as groupwise_max
 from gsstream.parts.motion.fitting import narrow_to as narrow_to
 from gsstream.parts.motion.groups import groups_of_rows as groups_of_rows
 from gsstream.parts.motion.groups import pixel_size as pixel_size
-from gsstream.parts.render.activations import activate_opacities as activate_opacities
-from gsstream.parts.render.activations import activate_scales as activate_scales
-from gsstream.parts.render.activations import logit as logit
-from gsstream.parts.render.activations import rgb_to_sh0 as rgb_to_sh0
 from gsstream.parts.render.activations import rotation_matrices as rotation_matrices
-from gsstream.parts.render.backward import backward as backward
 from gsstream.parts.render.backward import rows_backward as rows_backward
-from gsstream.parts.residual.decode import add_joint as add_joint
-from gsstream.parts.residual.decode import decode_joint as decode_joint
-from gsstream.parts.residual.decode import join_features as join_features
-from gsstream.parts.residual.decode import joint_vjp as joint_vjp
-from gsstream.parts.residual.layout import JointLayout as JointLayout
-from gsstream.parts.residual.layout import joint_layout as joint_layout
 from gsstream.parts.residual.rate import rate_gradient as rate_gradient
-from gsstream.parts.residual.row_parameters import RowParameters as RowParameters
-from gsstream.parts.update.base import MAX_SYMBOL as MAX_SYMBOL

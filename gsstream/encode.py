@@ -46,13 +46,13 @@ from gsstream.input.recordings.base import SourceInfo
 from gsstream.input.recordings.canonical import CanonicalSource, recording_similarity
 from gsstream.method.base import StreamingMethod
 from gsstream.packet import StreamWriter as StreamWriter
+from gsstream.parts.backend.base import Renderer
 from gsstream.parts.confidence.base import ConfidenceEstimator
 from gsstream.parts.gate.base import GateSampler
 from gsstream.parts.growth.base import Growth
 from gsstream.parts.motion.base import MotionPart
 from gsstream.parts.propagation.base import Propagation
 from gsstream.parts.regularizer.base import Regularizer
-from gsstream.parts.render.base import Renderer
 from gsstream.parts.structure.base import Structure
 from gsstream.parts.update.base import UpdateRule
 from gsstream.recipe.load import resolve_recipe

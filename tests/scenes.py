@@ -9,18 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsstream.api import (
-    ATTRIBUTES,
-    Cameras,
-    Displacement,
-    FrameLog,
-    Gaussians,
-    Layout,
-    LossAndGrad,
-    Scene,
-    ScreenGradient,
-    Wrt,
-)
+from gsstream.api import ATTRIBUTES, Cameras, Displacement, FrameLog, Gaussians, Layout, Scene
+from gsstream.backend import LossAndGrad, ScreenGradient, Wrt
 from gsstream.testing import World
 
 #: Two cameras in one place.

@@ -56,10 +56,8 @@ _KINDS = (
     PartKind("regularizer", "gsstream.parts.regularizer.base:Regularizer", slot=True, default="none", behaviour=True),
     PartKind("streaming_method", "gsstream.method.base:StreamingMethod", default="parts"),
     PartKind(
-        "renderer", "gsstream.parts.render.base:Renderer", default="auto", use="--set renderer=<name> --source demo"
+        "renderer", "gsstream.parts.backend.base:Renderer", default="auto", use="--set renderer=<name> --source demo"
     ),
-    PartKind("loss", "gsstream.parts.loss.base:Loss", use="--set loss.backend=<name> --source demo"),
-    PartKind("optimiser", "gsstream.parts.optimiser.base:RowOptimiser", use=None),
     PartKind("source", None, use="--source <name>:"),
 )
 

@@ -19,7 +19,8 @@ from gsstream.parts.render.work import FitContext
 if TYPE_CHECKING:
     from gsstream.core.frame import Frame, PointCloud
     from gsstream.core.rng import Rng
-    from gsstream.parts.render.base import Renderer, RenderSession
+    from gsstream.parts.backend.base import Renderer
+    from gsstream.parts.render.session import RenderSession
     from gsstream.parts.render.target import ViewTarget
 
 

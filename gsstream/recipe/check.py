@@ -15,6 +15,8 @@ from gsstream.recipe.model import SCHEMA_VERSION, ComponentRef, Recipe
 
 #: Most problems listed at once; a file with more is probably not a recipe.
 MAX_PROBLEMS = 30
+#: What a renderer brings, which a recipe does not choose.
+RENDERERS_OWN = ("loss", "optimiser")
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -59,6 +61,8 @@ def _full_path(path: KeyPath, leaf: Leaf, shorthand: bool) -> tuple[KeyPath, str
             if model is ComponentRef:
                 hint = f"; a part's own settings go under '{'.'.join(path[:depth])}.params'"
                 return path, f"unknown key {name!r}{hint}", depth + 1
+            if name in RENDERERS_OWN:
+                return path, f"unknown key {name!r}: the {name} is part of the renderer, so renderer.name chooses it", 1
             return path, f"unknown key {name!r}{suggest(key, model.model_fields)}", depth + 1
         annotation = model.model_fields[key].annotation
         last = depth == len(path) - 1

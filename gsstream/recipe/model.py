@@ -150,14 +150,6 @@ class Stream(Section):
         return self
 
 
-class Loss(Section):
-    """Photometric loss 0.8 L1 + 0.2 (1 - SSIM), as in 3DGS."""
-
-    backend: str = Field(
-        default="auto", description="implementation; auto: the fastest that works here (all give the same value)"
-    )
-
-
 class Codec(Section):
     """How packets are written."""
 
@@ -209,7 +201,6 @@ class Recipe(Section):
     )
     first_frame: FirstFrame = Field(default=FirstFrame(), description="frame 0")
     stream: Stream = Field(default=Stream(), description="later frames")
-    loss: Loss = Field(default=Loss(), description="photometric loss")
     codec: Codec = Field(default=Codec(), description="packets")
     budget: Budget = Field(default=Budget(), description="what a frame may cost; nothing given: no limits")
     data: DataOptions = Field(default=DataOptions(), description="the split, and what is done about bad images")

@@ -18,7 +18,7 @@ from gsstream.core.context import RowGradient, ScreenGradient
 from gsstream.core.frame import PointCloud
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.parts.backend.reference import ReferenceRenderer
 from gsstream.parts.structure.base import Anchors
 
 RENDERER = ReferenceRenderer()

@@ -25,11 +25,10 @@ from gsstream.testing.examples.streaming_method import ExampleMethod
 from gsstream.testing.examples.structure import ExampleStructure
 from gsstream.testing.examples.update import ExampleUpdate
 from gsstream.testing.kit import all_checks, summary
-from gsstream.testing.loss.example import ExampleLoss
 from gsstream.testing.source.example import ExampleSource
 
 EXAMPLES = [ExampleStructure(), ExampleConfidence(), ExamplePropagation(), ExampleGate(), ExampleRegularizer()]
-EXAMPLES += [ExampleMethod(), ExampleUpdate(), ExampleLoss()]
+EXAMPLES += [ExampleMethod(), ExampleUpdate()]
 TINY = "synthetic:frames=4&views=3&width=32&height=24&supersample=1"
 #: A setting that matters, and a source whose shortest recording is none.
 OTHERS = [Uniform(Uniform.Config(logit=-50)), SourceUnderTest(open_source, TINY)]
@@ -156,8 +155,6 @@ CLAIMS: dict[str, dict[str, Any]] = {
     "gate/always-open": {},
     "gate/binary-ste": {"stochastic": True, "differentiable": True, "temperature": True},
     "gate/gumbel-sigmoid": {"stochastic": True, "differentiable": True, "temperature": True},
-    "loss/cpu": {"takes_bytes": True},
-    "loss/reference": {},
     "motion/hicom": {"finds_motion": True, "momentum": 0.6},
     "motion/keypoints": {"finds_motion": True, "momentum": 0.0},
     "motion/recon": {"finds_motion": True, "momentum": 0.6},

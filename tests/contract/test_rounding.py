@@ -11,9 +11,9 @@ from gsstream_cpu_render.renderer import CpuRenderer
 from gsstream_cpu_render.session import CpuSession
 
 from gsstream.parts.render.wrt import LossAndGrad, WrtScene
+from gsstream.testing import loss_and_grad
 from gsstream.testing.cases import get_case
 from gsstream.testing.compare import gradients_equal, relative
-from gsstream.testing.renderer import loss_and_grad
 
 EPS = torch.finfo(torch.float32).eps
 

@@ -21,8 +21,8 @@ REASONS = {
     "hookimpl definition: gsstream_components(registry) Argument(s) {'registry'} are declared in the hookimpl but ",
     "wrong_return": "gsstream_components() returned a str in its list; expected ComponentSpec",
     "bad_spec": "ValidationError: ComponentSpec of component API 3.0: kind: Input should be 'structure', 'confidence', "
-    "'propagation', 'gate', 'motion', 'update', 'growth', 'regularizer', 'streaming_method', 'renderer', 'loss', "
-    "'optimiser' or 'source', got 'gatte'",
+    "'propagation', 'gate', 'motion', 'update', 'growth', 'regularizer', 'streaming_method', 'renderer' "
+    "or 'source', got 'gatte'",
     "command_clash": "declares the command 'run', which gsstream 0.1.0 already provides; rename it",
     "closes_stdout": "it closed stdout while it was loaded; what it closed is open again",
     "closes_numbers": "it closed stdout and stderr while it was loaded; what it closed is open again",

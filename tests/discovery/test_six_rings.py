@@ -17,7 +17,7 @@ BROKEN = Path(__file__).parent / "broken"
 PAGE = Path(__file__).parents[2] / "docs" / "plugin-failures.md"
 RUN = [
     "run", "--source", "synthetic:frames=5&views=2&width=32&height=24&supersample=1", "--quiet", "--no-pictures",
-    "--set", "renderer=reference", "--set", "loss.backend=reference", "--set", "first_frame.max_iterations=3",
+    "--set", "renderer=reference", "--set", "first_frame.max_iterations=3",
     "--set", "first_frame.max_points=60", "--set", "stream.epochs=1",
     "--set", "first_frame.prune_error=0", "--set", "first_frame.shell=false",
 ]  # fmt: skip

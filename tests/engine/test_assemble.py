@@ -17,7 +17,7 @@ from gsstream.discovery.discovery import Discovered
 from gsstream.engine.assembly.assemble import SLOTS, Assembly, assemble
 from gsstream.engine.assembly.choose_renderer import SlowRendererWarning
 from gsstream.engine.assembly.title import title
-from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.parts.backend.reference import ReferenceRenderer
 from gsstream.recipe.load import ResolvedRecipe, resolve_recipe
 from gsstream.recipe.model import ComponentRef, Recipe
 from gsstream.spec import ComponentSpec
@@ -91,7 +91,7 @@ def renderer_plugin(target: str) -> Catalog:
 def test_auto_takes_the_cpu_renderer_when_it_works() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assembly = assemble(Recipe(), renderer_plugin("gsstream.parts.render.reference:ReferenceRenderer"))
+        assembly = assemble(Recipe(), renderer_plugin("gsstream.parts.backend.reference:ReferenceRenderer"))
     assert assembly.recipe.renderer.name == "cpu"
 
 
@@ -111,7 +111,7 @@ def test_a_wrong_setting_of_the_environment_is_an_error_and_no_reason_to_be_slow
 
     monkeypatch.setattr(ReferenceRenderer, "__init__", refuse)
     with pytest.raises(InputError, match=r"renderer 'cpu' \(from .*\) could not be built: GSSTREAM_ISA: expected one"):
-        assemble(Recipe(), renderer_plugin("gsstream.parts.render.reference:ReferenceRenderer"))
+        assemble(Recipe(), renderer_plugin("gsstream.parts.backend.reference:ReferenceRenderer"))
 
 
 def test_auto_takes_no_settings(builtin: Catalog) -> None:

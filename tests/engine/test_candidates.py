@@ -15,8 +15,10 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.engine.step.active.candidates import VoteCache, candidates, changed_rows, keep_mask
 from gsstream.engine.step.active.change import Change
-from gsstream.parts.render.base import TILE, RenderSession, ScatterSession
-from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.parts.backend.base import ScatterSession
+from gsstream.parts.backend.reference import ReferenceRenderer
+from gsstream.parts.render.images import TILE
+from gsstream.parts.render.session import RenderSession
 from gsstream.testing.cases import BLACK, scene
 
 WIDTH, HEIGHT, FOCAL = 56, 40, 40.0

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from gsstream.core.errors import InputError, PluginUnavailable, RecipeError
-from gsstream.core.part import PartConfig
+from gsstream.core.part import PartConfig, unwrapped
 from gsstream.discovery.catalog import Catalog, load_catalog
 from gsstream.engine.assembly.assemble import assemble
 from gsstream.engine.assembly.choose_renderer import VARIABLE, choose_renderer
-from gsstream.parts.loss.photometric import ReferenceLoss
-from gsstream.parts.optimiser.adam import ReferenceAdam
-from gsstream.parts.render.base import Renderer
+from gsstream.parts.backend.adam import ReferenceAdam
+from gsstream.parts.backend.base import Renderer
+from gsstream.parts.render.loss import ReferenceLoss
 from gsstream.recipe.load import resolve_recipe
 
 GPU = "NVIDIA GeForce RTX 4090"
@@ -81,8 +81,8 @@ def test_a_gpu_is_used_and_named(machine: pytest.MonkeyPatch) -> None:
     parts = assembled(with_gsplat(machine, OnGpu))
     assert parts.recipe.renderer.name == "gsplat"
     assert parts.note.startswith(f"rendering on {GPU} with gsplat")
-    assert isinstance(parts.part("loss"), ReferenceLoss), "the loss and the optimiser work where the renderer does"
-    assert isinstance(parts.part("optimiser"), ReferenceAdam)
+    assert type(unwrapped(parts.renderer.loss)) is ReferenceLoss, "the defaults work where the renderer does"
+    assert type(unwrapped(parts.renderer.optimiser)) is ReferenceAdam
 
 
 @pytest.mark.parametrize(

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from bundle import Bundle
 from early_densify import densifying
 from growing_plugin import growth_installed
 
 import gsstream
-from gsstream.api import LossTraits
 from gsstream.cli.main import run_command
 from gsstream.core.errors import ComponentError, InputError, RecipeError, ShapeError
 from gsstream.core.frame import Frame
@@ -203,8 +203,6 @@ class BrokenGrowth:
 
     prepare = evaluate = propose
 
-    claims = LossTraits
-
 
 @pytest.mark.parametrize("case", list(CASES))
 def test_a_frame_that_fails_leaves_the_encoder_as_it_was(case: str) -> None:
@@ -229,10 +227,10 @@ def test_a_frame_that_fails_leaves_the_encoder_as_it_was(case: str) -> None:
 def test_frame_0_that_fails_can_be_made_again() -> None:
     made = encoder()
     sound = made.assembly
-    made.assembly = replace(sound, loss=BrokenGrowth())
+    made.assembly = replace(sound, renderer=Bundle(sound.part("renderer"), loss=BrokenGrowth()))
     with pytest.raises(ComponentError) as caught:
         made.encode(frames()[0])
-    assert (caught.value.slot, caught.value.frame) == ("loss", 0)
+    assert (caught.value.slot, caught.value.frame) == ("renderer.loss", 0)
     assert made.state is None
     made.assembly = sound
     assert made.encode(frames()[0]).packet.data == packets(whole("still"))[0]
@@ -368,7 +366,7 @@ def test_the_package_shows_its_doors_and_opens_them_when_they_are_named() -> Non
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False", "False", "True", "False"]
-    with pytest.raises(AttributeError, match="no attribute 'plays'; its front doors are api, blocks, encode"):
+    with pytest.raises(AttributeError, match="no attribute 'plays'; its front doors are api, backend, blocks, encode"):
         _ = gsstream.plays
 
 

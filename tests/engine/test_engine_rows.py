@@ -12,8 +12,8 @@ from gsstream.core.rng import Rng
 from gsstream.engine.state.stream_state import StreamState, next_state
 from gsstream.engine.step.optimise import current_level, level_schedule
 from gsstream.packet import decode_packet, encode_delta, encode_key
+from gsstream.parts.backend.adam import ReferenceAdam
 from gsstream.parts.motion.none import Still
-from gsstream.parts.optimiser.adam import ReferenceAdam
 from gsstream.parts.residual.row_parameters import RowParameters, TopologyEdit
 from gsstream.recipe.model import Stream
 from gsstream.testing.packet import tiny_key

@@ -15,11 +15,11 @@ from gsstream_cpu_render.residual import CpuResidualOptimiser
 
 from gsstream.engine.step.optimise import lr_factor
 from gsstream.packet import StreamReader
-from gsstream.parts.optimiser.adam import ReferenceAdam
+from gsstream.parts.backend.adam import ReferenceAdam
 from gsstream.parts.residual.adam_state import AdamState
 from gsstream.parts.residual.optimiser import ResidualOptimiser
 from gsstream.parts.residual.reference import JointResidualOptimiser
-from gsstream.testing.optimiser.checks import residual_case
+from gsstream.testing.optimiser import residual_case
 
 FACTORS = (1.0, 0.5, 0.01)
 

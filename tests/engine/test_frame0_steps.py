@@ -23,8 +23,8 @@ from gsstream.engine.fit.nearest import nearest_rows, neighbour_distance
 from gsstream.engine.frame0.axes import nearest_axes
 from gsstream.engine.frame0.optimise import FirstFrameRun
 from gsstream.engine.frame0.pyramid import keep_widths, one_size, plan_pyramid
+from gsstream.parts.backend.reference import ReferenceRenderer
 from gsstream.parts.render.activations import rotation_matrices
-from gsstream.parts.render.reference import ReferenceRenderer
 from gsstream.recipe.model import FirstFrame
 
 SETTINGS = FirstFrame(lr_means=1e-3)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from bundle import Bundle
 
 from gsstream.core.changes import AddedGaussians, RowEdit
 from gsstream.core.errors import ComponentError
@@ -28,11 +29,13 @@ from gsstream.engine.assembly.guard import Guarded, guard
 from gsstream.engine.run.run_frame import RepeatedFrameWarning
 from gsstream.engine.step import frame_step as step_module
 from gsstream.packet import decode_packet
+from gsstream.parts.backend.adam import ReferenceAdam
+from gsstream.parts.backend.reference import ReferenceRenderer
+from gsstream.parts.backend.row_optimiser import RowOptimiser
 from gsstream.parts.gate.always_open import AlwaysOpen
 from gsstream.parts.gate.base import SampledGate
 from gsstream.parts.growth.base import Growth
-from gsstream.parts.optimiser.base import RowOptimiser
-from gsstream.parts.render.base import RenderSession
+from gsstream.parts.render.session import RenderSession
 from gsstream.testing.cases import rig, scene
 
 WORLD = "synthetic:frames=5&views=2&width=32&height=24&supersample=1"
@@ -60,8 +63,8 @@ FUNCTIONS: dict[tuple[str, str], tuple[bool, bool]] = {
     ("update", "init_decoders"): (True, False),
     ("growth", "propose"): (False, False),
     ("regularizer", "penalty"): (False, True),
-    ("loss", "evaluate"): (False, True),
-    ("optimiser", "step"): (False, True),
+    ("renderer.loss", "evaluate"): (False, True),
+    ("renderer.optimiser", "step"): (False, True),
     ("session", "render"): (False, True),
     ("session", "visible"): (False, False),
     ("session", "screen_gradient"): (False, False),
@@ -138,7 +141,9 @@ class FailingSession(RenderSession):
 
 
 class FailingRenderer(Failing):
-    """Its sessions fail."""
+    """Its sessions fail; they are no others than those that the reference optimiser knows."""
+
+    optimiser = ReferenceAdam()
 
     def open(self, *args: Any) -> Any:
         return FailingSession(self.part.open(*args), self)
@@ -154,7 +159,14 @@ def encoder(slot: str, make: Callable[[Any, Where], Any], **settings: Any) -> En
     """An encoder in which the part of one slot is replaced."""
     with open_recording(WORLD) as source:
         made = encoder_for("s2gs-edge", source, {**TINY, **settings})
-    made.assembly = replace(made.assembly, **{slot: make(made.assembly.part(slot), made.assembly.where)})
+    slot, _, member = slot.partition(".")
+    part = made.assembly.part(slot)
+    if member:  # of the reference, which calls its loss and its optimiser one at a time
+        part = ReferenceRenderer()
+        made_part: Any = Bundle(part, **{member: make(getattr(part, member), made.assembly.where)})
+    else:
+        made_part = make(part, made.assembly.where)
+    made.assembly = replace(made.assembly, **{slot: made_part})
     return made
 
 
@@ -206,7 +218,7 @@ def test_what_a_function_raises_is_said_with_its_place_and_costs_one_frame(slot:
 
 
 def test_a_part_that_fails_in_frame_0_ends_there() -> None:
-    called = (("structure", "seed"), ("structure", "build"), ("update", "init_decoders"), ("loss", "prepare"))
+    called = (("structure", "seed"), ("structure", "build"), ("update", "init_decoders"), ("renderer.loss", "prepare"))
     for slot, function in called:
         made = encoder(
             slot, lambda part, where, name=function: Failing(part, name, where, 0), **{"stream.on_error": "repeat"}
@@ -306,9 +318,12 @@ class TestGuard:
 
     def test_every_part_of_an_assembly_is_guarded_once(self) -> None:
         parts = encoder("gate", lambda part, _: part).assembly
-        others = "streaming_method", "renderer", "loss", "optimiser"
+        others = "streaming_method", "renderer"
         for slot in ("structure", "confidence", "gate", "motion", "growth", *others):
             assert isinstance(getattr(parts, slot), Guarded)
             assert not isinstance(parts.part(slot), Guarded)
+        for member in (parts.renderer.loss, parts.renderer.optimiser):
+            assert isinstance(member, Guarded)
+            assert not isinstance(unwrapped(member), Guarded)
         with pytest.raises(ComponentError, match=r"propagation .* failed at frame None"):
             parts.propagation.propagate(torch.zeros(3), "no hierarchy")

@@ -13,7 +13,7 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.picture_size import area_price
 from gsstream.engine.fit import constants
 from gsstream.engine.frame0.penalties import add_penalty_grad
-from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.parts.backend.reference import ReferenceRenderer
 
 SIZE, EXTENT, PRICE = 64, 3.0, 0.01
 #: Gradient of an opacity that says that the view drew the row; it is small beside the penalties.

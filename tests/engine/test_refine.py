@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from bundle import Bundle
 
-from gsstream.api import LossTraits
 from gsstream.core.changes import AddedGaussians, Delta, Layout, RowEdit, Scene
 from gsstream.core.errors import ComponentError
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.encode import Callbacks, Encoder, encoder_for, open_recording
+from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.densify import DensifyStatistics
 from gsstream.engine.frame0 import refine
 from gsstream.engine.frame0.axes import nearest_axes
@@ -153,7 +154,10 @@ class Broken:
         raise RuntimeError("out of order")
 
     evaluate = prepare
-    claims = LossTraits
+
+
+def broken(sound: Assembly) -> Assembly:
+    return replace(sound, renderer=Bundle(sound.part("renderer"), loss=Broken()))
 
 
 def test_a_refinement_that_fails_leaves_the_encoder_as_it_was() -> None:
@@ -161,7 +165,7 @@ def test_a_refinement_that_fails_leaves_the_encoder_as_it_was() -> None:
     sound = made.assembly
     made.encode(frames()[0])
     before = made.state
-    made.assembly = replace(sound, loss=Broken())
+    made.assembly = broken(sound)
     with pytest.raises(ComponentError, match=r"failed at frame 1, .*out of order"):
         made.encode(frames()[1])
     assert made.state is before
@@ -175,7 +179,7 @@ def test_a_refinement_that_fails_is_left_out_and_its_iterations_are_made_later()
     made = encoder(**{"stream.on_error": "repeat"})
     sound, lines = made.assembly, []
     for frame in frames():
-        made.assembly = replace(sound, loss=Broken()) if frame.index == 2 else sound
+        made.assembly = broken(sound) if frame.index == 2 else sound
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             lines.append(made.encode(frame).metrics)

@@ -14,7 +14,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.engine.frame0.regularisers import DROPOUT, MOST_OPAQUE, Dropout, Regularisers, choose_regularisers
 from gsstream.engine.frame0.smooth_depth import PLACED, SmoothDepth
-from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.parts.backend.reference import ReferenceRenderer
 from gsstream.parts.render.wrt import NEVER_DRAWN, WrtScene
 from gsstream.recipe.model import FirstFrame
 

@@ -21,9 +21,9 @@ from gsstream.engine.frame0.prune import prune_by_error, removal_errors, retaine
 from gsstream.packet import EncodedPacket, PacketKind, decode_packet, encode_key, first_layer
 from gsstream.packet.base import parse_packet
 from gsstream.packet.key import KeyState
-from gsstream.parts.render.base import Renderer
+from gsstream.parts.backend.base import Renderer
+from gsstream.parts.backend.reference import ReferenceRenderer
 from gsstream.parts.render.exposure import Exposure
-from gsstream.parts.render.reference import ReferenceRenderer
 
 BLACK = (0.0, 0.0, 0.0)
 GROWING = {"first_frame.max_iterations": 60}

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
+from bundle import Bundle
 from flow_runs import TINY, WORLD
 
 from gsstream.cli.main import run_command
@@ -20,12 +21,13 @@ from gsstream.engine.assembly.checks import Checks, Look, requested_checks
 from gsstream.engine.assembly.fault import Where
 from gsstream.engine.run.recording import open_recording
 from gsstream.engine.run.session import run
+from gsstream.parts.backend.base import Renderer, ScatterSession
+from gsstream.parts.backend.reference import ReferenceRenderer
+from gsstream.parts.backend.row_optimiser import RowOptimiser
 from gsstream.parts.gate.always_open import AlwaysOpen
 from gsstream.parts.gate.base import GateSampler
-from gsstream.parts.loss.base import Loss
-from gsstream.parts.optimiser.base import RowOptimiser
-from gsstream.parts.render.base import Renderer, RenderOutput, ScatterSession
-from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.parts.render.loss import Loss
+from gsstream.parts.render.session import RenderOutput
 from gsstream.recipe.load import resolve_recipe
 
 CATALOG = load_catalog()
@@ -138,7 +140,10 @@ def assembly(level: str | None, method: str = "dense", **parts: Any) -> Assembly
     # Some of the parts below count their renders, and rounding frame 0 makes some, as layers do.
     keys |= {"codec.key_rd_lambda": 0, "codec.first_layer": 1}
     sets = [("--set", f"{key}={value}") for key, value in keys.items()]
-    return replace(assemble(resolve_recipe(method, CATALOG.recipe_path, (), sets), CATALOG, level), **parts)
+    made = assemble(resolve_recipe(method, CATALOG.recipe_path, (), sets), CATALOG, level)
+    if brought := {name: parts.pop(name) for name in ("loss", "optimiser") if name in parts}:
+        parts["renderer"] = Bundle(ReferenceRenderer(), **brought)
+    return replace(made, **parts)
 
 
 @pytest.fixture(autouse=True)
@@ -187,23 +192,25 @@ FOUND = {
         {"renderer": WrongRenderer}, ("renderer", "WrongRenderer", 1, 3),
         ("image of view ", "got nan at index [7, 9, 0] (3 of 1152 values)"),
     ),
-    "a loss": Found({"loss": WrongLoss}, ("loss", "WrongLoss", 1, 3), ("got inf",)),
+    "a loss": Found({"loss": WrongLoss}, ("renderer.loss", "WrongLoss", 1, 3), ("got inf",)),
     "frame 0, whose iterations count from 1": Found(
         {"renderer": WrongRenderer}, ("renderer", "WrongRenderer", 0, 4), (), iterations=6
     ),
-    "a whole method": Found({"loss": WrongLoss}, ("loss", "WrongLoss", 1, 4), (), method="queen"),
-    "a step of the optimiser": Found({"optimiser": WrongOptimiser}, ("optimiser", "WrongOptimiser", 1, 3), ()),
+    "a whole method": Found({"loss": WrongLoss}, ("renderer.loss", "WrongLoss", 1, 4), (), method="queen"),
+    "a step of the optimiser": Found(
+        {"optimiser": WrongOptimiser}, ("renderer.optimiser", "WrongOptimiser", 1, 3), ()
+    ),
     "a gradient": Found(
-        {"loss": WrongGradient}, ("loss", "WrongGradient", 1, 3), ("got nan at index [7, 9, 0]",)
+        {"loss": WrongGradient}, ("renderer.loss", "WrongGradient", 1, 3), ("got nan at index [7, 9, 0]",)
     ),
     # The default: what was learned is looked at before it is sent, so that no such stream exists.
-    # The last of nine steps: the native loss refuses a picture that is not finite.
+    # The last of nine steps: the loss refuses a picture that is not finite.
     "at the end of a frame": Found(
-        {"renderer": ReferenceRenderer, "optimiser": WrongOptimiser}, ("update", "Additive", 1, None),
+        {"optimiser": WrongOptimiser}, ("update", "Additive", 1, None),
         ("GSSTREAM_CHECKS=step finds the first", "got nan at index [4, 0] (Gaussian 4)"), "frame", calls=-5,
     ),
     "what one part refuses of another": Found(
-        {"loss": WrongGradient}, ("optimiser", "CpuAdam", 1, 3), ("got nan in row ",), "frame"
+        {"loss": WrongGradient}, ("renderer.optimiser", "ReferenceAdam", 1, 3), ("got nan at index",), "frame"
     ),
 }  # fmt: skip
 

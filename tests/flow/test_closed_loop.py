@@ -22,8 +22,8 @@ from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.rng import Rng
 from gsstream.engine.run.player_difference import difference_between
 from gsstream.engine.step import frame_step as step_module
+from gsstream.parts.backend.reference import ReferenceRenderer
 from gsstream.parts.motion.rigid import Rigid
-from gsstream.parts.render.reference import ReferenceRenderer
 from gsstream.parts.render.work import FitContext
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, find_renderer, render

@@ -14,7 +14,7 @@ from gsstream_cpu_render.session import CpuSession
 from gsstream.core.context import ScreenGradient
 from gsstream.engine.step import frame_step as step_module
 from gsstream.packet import StreamReader
-from gsstream.parts.render.base import ScatterSession
+from gsstream.parts.backend.base import ScatterSession
 
 
 @pytest.fixture(scope="module")

@@ -412,7 +412,7 @@ class TestTools:
         offset = 0.1 * torch.randn(3, 3, generator=generator)
         extra = {**player.meta.extra, "exposure": {"matrix": matrix.tolist(), "offset": offset.tolist()}}
         work = subject.encoder()._tools().open(replace(player, meta=replace(player.meta, extra=extra)), before, now)
-        found, loss = work.loss_and_grad(1, WrtRows(work.gaussians)), subject.assembly.loss
+        found, loss = work.loss_and_grad(1, WrtRows(work.gaussians)), subject.assembly.renderer.loss
         leaves = work.gaussians.map(lambda value: value.clone().requires_grad_())
         drawn = subject.assembly.renderer.render(leaves, now.cameras, 1, subject.assembly.background).image
         shown = Exposure(matrix, offset)[1].apply(drawn)

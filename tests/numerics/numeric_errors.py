@@ -8,10 +8,9 @@ import numpy as np
 import torch
 from numeric_scenes import camera, random_scene, rendered, upstream, worst
 
-from gsstream.parts.loss.base import Loss
-from gsstream.parts.loss.photometric import ReferenceLoss
-from gsstream.parts.render.base import Renderer
-from gsstream.parts.render.reference import ReferenceRenderer, composite, evaluate_sh, project
+from gsstream.parts.backend.base import Renderer
+from gsstream.parts.backend.reference import ReferenceRenderer, composite, evaluate_sh, project
+from gsstream.parts.render.loss import Loss, ReferenceLoss
 from gsstream.player.software import render_numpy
 from gsstream.testing.cases import rig
 

@@ -24,9 +24,9 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.packet.grids import KEY_BITS, from_codes, to_codes
 from gsstream.packet.symbols import decode_symbols, encode_symbols
-from gsstream.parts.optimiser.adam import ReferenceAdam
-from gsstream.parts.optimiser.base import RowOptimiser
-from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.parts.backend.adam import ReferenceAdam
+from gsstream.parts.backend.reference import ReferenceRenderer
+from gsstream.parts.backend.row_optimiser import RowOptimiser
 from gsstream.parts.residual.adam_state import ADAM_BETAS, ADAM_EPS, AdamState
 from gsstream.parts.residual.rate import channel_spread, laplace_gradient
 from gsstream.parts.update.base import init_latents

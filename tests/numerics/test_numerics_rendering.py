@@ -16,8 +16,8 @@ from numeric_scenes import Scene, blobs, camera, random_scene, rendered, upstrea
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError
-from gsstream.parts.render.base import Renderer
-from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.parts.backend.base import Renderer
+from gsstream.parts.backend.reference import ReferenceRenderer
 from gsstream.player.software import render_numpy
 
 BACK = (0.2, 0.5, 0.9)

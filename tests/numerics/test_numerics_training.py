@@ -24,8 +24,8 @@ from gsstream.engine.step.active.change import detect_changed_tiles
 from gsstream.engine.step.optimise import _Fit
 from gsstream.input.recordings.open import open_source
 from gsstream.metrics import psnr
-from gsstream.parts.optimiser.adam import ReferenceAdam
-from gsstream.parts.optimiser.base import RowOptimiser
+from gsstream.parts.backend.adam import ReferenceAdam
+from gsstream.parts.backend.row_optimiser import RowOptimiser
 from gsstream.parts.residual.adam_state import MAX_GRADIENT, AdamState
 from gsstream.testing.streaming_method import SOURCE, MethodUnderTest
 

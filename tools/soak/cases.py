@@ -92,7 +92,6 @@ SOMETIMES: Mapping[str, Draw] = MappingProxyType({
     "stream.rd_lambda": _of(0.0, 1e-5, 3e-4, 1e-2, 1.0), "stream.on_error": _of("raise", "repeat"),
     "stream.progressive": _of(False, True),
     "stream.lr_final_factor": _of(1.0, 0.1, 1e-6),
-    "loss.backend": _of("auto", "reference"),
     "codec.key_interval": _of(0, 1, 2, 3),
     "data.leak": _of("none", "points", "training"),
 })  # fmt: skip

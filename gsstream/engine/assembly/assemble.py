@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
-from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
+from gsstream.core.errors import InputError, UnknownName
 from gsstream.core.kinds import METHOD_SLOTS, PART_KINDS
 from gsstream.core.part import Part, unwrapped
 from gsstream.discovery.catalog import Catalog
@@ -19,15 +19,13 @@ from gsstream.engine.assembly.guard import guard
 from gsstream.engine.assembly.recipe_keys import unused_keys
 from gsstream.engine.assembly.title import title
 from gsstream.method.base import StreamingMethod
+from gsstream.parts.backend.base import Renderer
 from gsstream.parts.confidence.base import ConfidenceEstimator
 from gsstream.parts.gate.base import GateSampler
 from gsstream.parts.growth.base import Growth
-from gsstream.parts.loss.base import Loss
 from gsstream.parts.motion.base import MotionPart
-from gsstream.parts.optimiser.base import RowOptimiser
 from gsstream.parts.propagation.base import Propagation
 from gsstream.parts.regularizer.base import Regularizer
-from gsstream.parts.render.base import Renderer
 from gsstream.parts.structure.base import Structure
 from gsstream.parts.update.base import UpdateRule
 from gsstream.recipe.check import join_problems, validate
@@ -37,12 +35,6 @@ from gsstream.recipe.model import ComponentRef, Recipe
 from gsstream.spec import ComponentSpec
 
 SLOTS = (*METHOD_SLOTS, "streaming_method", "renderer")
-#: Slots whose parts are called through a guard, which names the part in the errors that the part raises.
-GUARDED = (*SLOTS, "loss", "optimiser")
-#: The loss and the optimiser that are compiled for the processor, and those in torch, which work on any device.
-COMPILED, REFERENCE = "cpu", "reference"
-
-
 BLACK = (0.0, 0.0, 0.0)
 
 
@@ -76,8 +68,6 @@ class Assembly:
     regularizer: Regularizer
     streaming_method: StreamingMethod[Any]
     renderer: Renderer
-    loss: Loss
-    optimiser: RowOptimiser
     origins: Mapping[KeyPath, Origin] = field(default_factory=dict)
     distributions: tuple[str, ...] = ()
     checks: Checks = Checks.FRAME
@@ -87,7 +77,7 @@ class Assembly:
     where: Where = field(default_factory=Where, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        for slot in GUARDED:
+        for slot in SLOTS:
             object.__setattr__(self, slot, guard(slot, getattr(self, slot), self.where, self.checks))
 
     def part(self, slot: str) -> Part:
@@ -133,16 +123,13 @@ def assemble(
         if built is not None:
             parts[slot] = built
             refs[slot] = ComponentRef(name=ref.name, params=built.config.model_dump(mode="json"))
-    compiled = "renderer" not in parts or parts["renderer"].device.type == "cpu"
-    loss = _loss(resolved, catalog, problems, compiled)
-    if not compiled and (reason := _processor_only(parts)):
+    on_gpu = "renderer" in parts and parts["renderer"].device.type != "cpu"
+    if on_gpu and (reason := _processor_only(parts)):
         problems.append(f"renderer {refs['renderer'].name!r} works on a GPU, and {reason}; choose --renderer cpu")
     if "streaming_method" in parts:
         paths = list(unused_keys(resolved.recipe.model_copy(update=refs), parts["streaming_method"], parts))
         problems += _unused_key_messages(paths, resolved)
     join_problems(problems)
-    parts["loss"] = loss
-    parts["optimiser"] = _optimiser(catalog, compiled)
     declared = (catalog.entries.get((slot, ref.name)) for slot, ref in refs.items())
     owners = sorted({entry.distribution for entry in declared if entry})
     recipe = resolved.recipe.model_copy(update=refs)
@@ -197,32 +184,6 @@ def _build(
         return None
     config = validate(cls.Config, ref.params, resolved.near, prefix=(slot, "params"), problems=problems)
     return None if config is None else construct(slot, ref.name, cls, config=config, catalog=catalog)
-
-
-def _loss(resolved: ResolvedRecipe, catalog: Catalog, problems: list[str], compiled: bool) -> Part | None:
-    """The loss implementation the recipe names, or the fastest that works here (they agree to 1e-6)."""
-    wanted = resolved.recipe.loss.backend
-    automatic = (COMPILED, REFERENCE) if compiled else (REFERENCE,)
-    for name in automatic if wanted == "auto" else (wanted,):
-        try:
-            cls = catalog.resolve("loss", name)
-            return construct("loss", name, cls, config=cls.Config(), catalog=catalog)
-        except (UnknownName, PluginUnavailable) as error:
-            if wanted != "auto":
-                problems.append(f"{resolved.near(('loss', 'backend')).where}: loss.backend: {error}")
-    return None
-
-
-def _optimiser(catalog: Catalog, compiled: bool) -> Part:
-    """The fastest optimiser that works here; they agree to 1e-6, so a recipe does not choose."""
-    if compiled:
-        try:
-            cls = catalog.resolve("optimiser", COMPILED)
-            return construct("optimiser", COMPILED, cls, config=cls.Config(), catalog=catalog)
-        except (UnknownName, PluginUnavailable):
-            pass  # the reason why a plugin does not work is printed where its renderer is chosen
-    cls = catalog.resolve("optimiser", REFERENCE)
-    return construct("optimiser", REFERENCE, cls, config=cls.Config(), catalog=catalog)
 
 
 def _processor_only(parts: Mapping[str, Part]) -> str:

@@ -17,19 +17,21 @@ from gsstream.core.part import unwrapped
 from gsstream.engine.assembly.checks import Checks, Look
 from gsstream.engine.assembly.fault import Where, fault
 from gsstream.engine.assembly.output_checks import OUTPUT_CHECKS
-from gsstream.parts.optimiser.base import RowOptimiser
-from gsstream.parts.render.base import RenderSession
+from gsstream.parts.backend.row_optimiser import RowOptimiser
+from gsstream.parts.render.session import RenderSession
 from gsstream.parts.residual.optimiser import ResidualOptimiser
 
 T = TypeVar("T")
 #: The names under which the table below and that of the checks list what parts open: sessions of a renderer, residuals
 #: of an optimiser. Errors about them name the part.
 SESSION, RESIDUAL = "session", "residual"
+#: What a renderer brings: attributes that stand behind a guard of their own, so that an error names them.
+MEMBERS = ("loss", "optimiser")
 #: Default bodies that call other functions of their object, by kind and name. With the level "step", and where the
 #: object has no body of its own, they run on the guard, so that each of these calls is looked at.
 BODIES: Mapping[tuple[str, str], Callable[..., Any]] = {
     (SESSION, "loss_and_grad"): RenderSession.loss_and_grad,
-    ("optimiser", "residual_optimiser"): RowOptimiser.residual_optimiser,
+    ("renderer.optimiser", "residual_optimiser"): RowOptimiser.residual_optimiser,
     (RESIDUAL, "run"): ResidualOptimiser.run,
 }
 
@@ -95,6 +97,8 @@ class Guarded:
             # Never kept in ``__dict__``: a guard that holds itself would keep a render of every camera alive.
             return partial(self._on_guard, body)
         value = self._value(name)
+        if self._kind == "renderer" and name in MEMBERS:
+            return Guarded(f"renderer.{name}", value, self._where, self._level)
         if not callable(value) or isinstance(value, type):
             return value
         call = self._guarding(name, value)

@@ -73,6 +73,6 @@ OUTPUT_CHECKS: Mapping[tuple[str, str], Callable[[Look, tuple[Any, ...], Any], N
     ("growth", "propose"): _growth,
     ("renderer", "render"): _image,
     ("session", "render"): _image,
-    ("loss", "evaluate"): _loss,
-    ("optimiser", "step"): _optimiser,
+    ("renderer.loss", "evaluate"): _loss,
+    ("renderer.optimiser", "step"): _optimiser,
 }

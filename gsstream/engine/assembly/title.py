@@ -12,7 +12,7 @@ from gsstream.recipe.model import ComponentRef, Recipe
 
 #: Sections and keys that say what is encoded, where and how fast, and not by what.
 NOT_THE_METHOD = {"schema_version", "method", "seed", "renderer", "data", "scale", "frames"}
-NOR_THESE = {"loss.backend", "stream.on_error"}
+NOR_THESE = {"stream.on_error"}
 #: Changes that are written out; the rest is counted.
 SHOWN = 3
 

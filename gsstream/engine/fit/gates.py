@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 
 from gsstream.core.hierarchy import Hierarchy
+from gsstream.parts.backend.row_optimiser import RowOptimiser
 from gsstream.parts.gate.base import GateSampler
-from gsstream.parts.optimiser.base import RowOptimiser
 from gsstream.parts.regularizer.base import Regularizer
 from gsstream.parts.render.backward import backward
 from gsstream.parts.residual.adam_state import AdamState

@@ -9,9 +9,9 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import Gaussians
 from gsstream.engine.fit.frame_images import FrameImages
-from gsstream.parts.loss.base import Loss
-from gsstream.parts.render.base import Renderer
+from gsstream.parts.backend.base import Renderer
 from gsstream.parts.render.exposure import Exposure
+from gsstream.parts.render.loss import Loss
 from gsstream.parts.render.target import ViewTarget
 
 
@@ -20,14 +20,13 @@ class PhotometricLoss:
 
     def __init__(self, loss: Loss, dssim: float, images: FrameImages, exposure: Exposure | None) -> None:
         self._loss, self._dssim, self.images, self.exposure = loss, dssim, images, exposure
-        self._takes_bytes = loss.claims().takes_bytes
         self._prepared: dict[int, Any] = {}
 
     def view_target(self, view: int, tile_weights: torch.Tensor | None = None) -> ViewTarget:
         """Return the target that renders of a view are compared with."""
         image = self.images.stored(view)
         if view not in self._prepared:
-            self._prepared[view] = self._loss.prepare(image if self._takes_bytes else self.images[view])
+            self._prepared[view] = self._loss.prepare(image)
         exposure = self.exposure[view] if self.exposure else None
         return ViewTarget(
             loss=self._loss,

@@ -15,8 +15,8 @@ import torch
 
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
+from gsstream.parts.backend.base import Renderer
 from gsstream.parts.render.backward import backward, gradient_of
-from gsstream.parts.render.base import Renderer
 from gsstream.parts.render.exposure import Exposure
 
 

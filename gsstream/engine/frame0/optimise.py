@@ -164,7 +164,7 @@ class FirstFrameRun:
             self.widest = max(self.widest, constants.MAX_SHELL_SCALE * find_shell(frame.cameras).sigma)
         self.pyramid, self.iterations, self.generator = pyramid, pyramid.iterations, generator
         values = {name: value.to(self.device) for name, value in start.items()}
-        self.table = RowParameters(values, first_frame_lrs(self.settings, self.extent), assembly.optimiser)
+        self.table = RowParameters(values, first_frame_lrs(self.settings, self.extent), assembly.renderer.optimiser)
         self._set_level(pyramid.levels[0], None)
         #: Colour maps that are fitted along; None: those of the photometric loss stay.
         self.exposure: ExposureFit | None = None
@@ -193,7 +193,7 @@ class FirstFrameRun:
     def _set_level(self, level: PyramidLevel, exposure: Exposure | None) -> None:
         self.level, self.frame = level, shrink_frame(self.whole, level.factor)
         self.photometric = PhotometricLoss(
-            self.assembly.loss, constants.DSSIM, FrameImages(self.frame.images, self.device), exposure
+            self.assembly.renderer.loss, constants.DSSIM, FrameImages(self.frame.images, self.device), exposure
         )
         self.smooth_depth = SmoothDepth(self.renderer, self.frame, self.device)
         self.half_size = torch.tensor([self.frame.cameras.width / 2, self.frame.cameras.height / 2]).to(self.device)

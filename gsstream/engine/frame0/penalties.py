@@ -14,7 +14,7 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import Gaussians
 from gsstream.engine.fit import constants
-from gsstream.parts.render.reference import ALPHA_CUT
+from gsstream.parts.backend.reference import ALPHA_CUT
 
 #: Squared distance, in squared scene units, below which a Gaussian is taken to stand at it.
 NEAREST2 = 1e-12

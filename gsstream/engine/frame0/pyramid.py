@@ -16,7 +16,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.picture_size import WIDTH
 from gsstream.engine.fit import constants
-from gsstream.parts.render.reference import BLUR
+from gsstream.parts.backend.reference import BLUR
 from gsstream.recipe.model import FirstFrame
 
 #: Iterations of each level, the coarsest first, as a share of those that pictures of one size take.

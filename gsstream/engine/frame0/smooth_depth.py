@@ -9,9 +9,9 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
+from gsstream.parts.backend.base import Renderer
 from gsstream.parts.render.activations import rgb_to_sh0
 from gsstream.parts.render.backward import backward, gradient_of
-from gsstream.parts.render.base import Renderer
 
 #: Difference of two pixels, in [0, 1], over which a change of depth becomes e times cheaper.
 EDGE = 0.1

@@ -13,7 +13,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.shapes import FloatArray
 from gsstream.metrics import changed_mask, moving_mask, noise_sigma, psnr, ssim
 from gsstream.packet import PlayerState
-from gsstream.parts.render.base import Renderer
+from gsstream.parts.backend.base import Renderer
 
 #: Held-out PSNR of frame 0 below which training views are looked at, and how far it may lie below theirs, dB.
 LOW_PSNR_DB, MAX_DROP_DB = 20.0, 4.0

@@ -20,8 +20,8 @@ from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.method.base import Step as MethodStep
 from gsstream.packet import PlayerState
 from gsstream.parts.motion.base import MotionPart
-from gsstream.parts.render.base import RenderSession
 from gsstream.parts.render.exposure import Exposure
+from gsstream.parts.render.session import RenderSession
 
 
 @dataclass(frozen=True)

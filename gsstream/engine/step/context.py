@@ -23,8 +23,8 @@ from gsstream.engine.step.active.candidates import VoteCache, changed_rows
 from gsstream.engine.step.active.change import MAX_PIXEL_SIGMA, Change
 from gsstream.input.seeds.shell import in_shell
 from gsstream.metrics.noise import noise_sigma
-from gsstream.parts.optimiser.base import RowOptimiser
-from gsstream.parts.render.base import RenderSession
+from gsstream.parts.backend.row_optimiser import RowOptimiser
+from gsstream.parts.render.session import RenderSession
 from gsstream.parts.render.target import ViewTarget
 from gsstream.parts.render.wrt import G, LossAndGrad, Wrt
 
@@ -58,7 +58,7 @@ class EngineContext:
         self.log, self.key_rows = log, state.player.key_rows
         exposure = None if state.exposure is None else state.exposure.to(device)
         self.images = FrameImages(frame.images, device) if images is None else images
-        self.photometric = PhotometricLoss(assembly.loss, DSSIM, self.images, exposure)
+        self.photometric = PhotometricLoss(assembly.renderer.loss, DSSIM, self.images, exposure)
         self._session = state.session
         self._votes = None if change is None else VoteCache(change, frame.cameras)
 
@@ -144,7 +144,7 @@ class EngineContext:
 
     @property
     def optimiser(self) -> RowOptimiser:
-        return self._assembly.optimiser
+        return self._assembly.renderer.optimiser
 
     def scaled(self, number: float) -> int:
         return max(1, round(number * self._frame.epoch_scale * self._part_scale))

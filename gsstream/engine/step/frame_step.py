@@ -34,7 +34,7 @@ from gsstream.engine.step.quantise import encode_frame, quantise_residual
 from gsstream.method.tools import Tools
 from gsstream.packet import PlayerState, decode_packet, encode_empty
 from gsstream.parts.growth.none import NoGrowth
-from gsstream.parts.render.base import RenderSession
+from gsstream.parts.render.session import RenderSession
 from gsstream.parts.update.base import Scope
 
 

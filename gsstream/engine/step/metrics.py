@@ -10,7 +10,7 @@ from gsstream.core.changes import changing_rows, row_gates
 from gsstream.core.log import FrameLog
 from gsstream.engine.step.problem import Solution
 from gsstream.packet import EncodedPacket, PacketKind, PlayerState
-from gsstream.parts.render.base import RenderCache, RenderSession
+from gsstream.parts.render.session import RenderCache, RenderSession
 
 
 def step_numbers(solution: Solution | None, candidates: int, session: RenderSession | None) -> dict[str, Any]:

@@ -72,11 +72,11 @@ class _Fit:
             scale_steps(assembly.update.codes(), problem.step_scale), latents, self.decoders, problem.base
         )
         units, matrix = torch.from_numpy(layout.units_of(index)).to(device), self.code.join_decoders(self.decoders)
-        self.residual = assembly.optimiser.residual_optimiser(self.code, problem.base, units, matrix)
+        self.residual = assembly.renderer.optimiser.residual_optimiser(self.code, problem.base, units, matrix)
         self.gates = TrainedGates(
             gate=assembly.gate,
             regularizer=assembly.regularizer,
-            optimiser=assembly.optimiser,
+            optimiser=assembly.renderer.optimiser,
             lr=GATE_LR,
             logits=problem.logits,
             hierarchy=problem.hierarchy,

@@ -11,7 +11,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.changes import Layout
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.parts.render.base import RenderSession
+from gsstream.parts.render.session import RenderSession
 from gsstream.parts.render.target import ViewTarget
 
 

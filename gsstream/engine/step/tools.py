@@ -21,7 +21,7 @@ from gsstream.engine.step.context import EngineContext
 from gsstream.method.budget import FrameBudget
 from gsstream.method.tools import FirstFrame
 from gsstream.packet import PlayerState, StreamMeta
-from gsstream.parts.render.base import Renderer
+from gsstream.parts.backend.base import Renderer
 
 
 def _not_resuming(index: int) -> Frame:

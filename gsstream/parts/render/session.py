@@ -13,11 +13,10 @@ from gsstream.core.changes.motion import GroupTransforms
 from gsstream.core.context import RowGradient, ScreenGradient
 from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.parts.render.backward import backward, gradient_of
+from gsstream.parts.render.images import float_image, spread_to_pixels
 from gsstream.parts.render.target import ViewTarget
 from gsstream.parts.render.transforms import curvature_of, weighted_structure_tensor
 from gsstream.parts.render.wrt import G, LossAndGrad, Wrt, WrtTransforms
-
-TILE = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,9 +230,7 @@ def _compared(
     recorded = target.exposure.apply(image) if target.exposure else image
     loss, upstream = target.loss.evaluate(recorded, target.prepared, target.dssim, tiles)
     if target.tile_weights is not None:
-        height, width = image.shape[:2]
-        factors = target.tile_weights.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
-        upstream = upstream * factors[..., None]
+        upstream = upstream * spread_to_pixels(target.tile_weights, *image.shape[:2])[..., None]
     return loss, upstream
 
 
@@ -251,6 +248,5 @@ def _curvature(
     image = session.render(view, replace(rows, sh0=colour), tile_mask=wanted).image
     recorded = target.exposure.apply(image.detach()) if target.exposure else image.detach()
     # The gradient of a pixel by a colour is the share that its Gaussian has of the pixel's light.
-    truth = target.image if target.image.is_floating_point() else target.image.float() / recorded.new_tensor(255)
-    backward([image], [weighted_structure_tensor(recorded, truth)])
+    backward([image], [weighted_structure_tensor(recorded, float_image(target.image))])
     return curvature_of(rows.means, transforms, session.cameras, view=view, structure=gradient_of(colour)[:, 0] / SH0)

@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, final
+from typing import Any, final
 
 import torch
 
 from gsstream.parts.render.exposure import CameraExposure
-
-
-class ImageLoss(Protocol):
-    """What a session needs of a loss (``gsstream.api.Loss``)."""
-
-    def evaluate(
-        self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]: ...
+from gsstream.parts.render.loss import Loss
 
 
 @final
@@ -24,7 +17,7 @@ class ViewTarget:
     """What a render of one view is compared with.
 
     Arguments:
-        loss: the photometric loss.
+        loss: that of the renderer whose session is given the target.
         prepared: what its ``prepare`` made of ``image``.
         dssim: weight of 1 - SSIM, 0 to 1.
         image: [H, W, 3] what the camera recorded, float32 or uint8 of which 255 is 1.0; only the curvature of
@@ -34,7 +27,7 @@ class ViewTarget:
             and shows the session's scene as it is. None: every tile counts once.
     """
 
-    loss: ImageLoss
+    loss: Loss
     prepared: Any
     dssim: float
     image: torch.Tensor

@@ -22,7 +22,7 @@ class FitContext(FrameContext, Protocol):
 
     @property
     def optimiser(self) -> Any:
-        """The optimiser of the run (``gsstream.api.RowOptimiser``), for rows that a part fits on its own."""
+        """The optimiser of the run (``gsstream.backend.RowOptimiser``), for rows that a part fits on its own."""
 
     @property
     def log(self) -> FrameLog:

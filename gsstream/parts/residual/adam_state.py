@@ -36,7 +36,7 @@ class AdamState:
 
 
 class RowSteps(Protocol):
-    """What makes Adam steps on tables by name: :class:`gsstream.parts.optimiser.base.RowOptimiser`."""
+    """What makes Adam steps on tables by name: :class:`gsstream.parts.backend.row_optimiser.RowOptimiser`."""
 
     def step(
         self,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol, final
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, final
 
 import torch
 
@@ -14,6 +14,9 @@ from gsstream.parts.render.session import RenderSession
 from gsstream.parts.render.target import ViewTarget
 from gsstream.parts.render.wrt import WrtRows
 from gsstream.parts.residual.adam_state import AdamState
+
+#: The sessions of the renderer that an optimiser belongs to: those of other renderers do not reach it.
+S = TypeVar("S", bound=RenderSession)
 
 
 class Gates(Protocol):
@@ -74,7 +77,7 @@ class Iteration(NamedTuple):
 
 @final
 @dataclass(frozen=True, slots=True, eq=False)
-class ResidualEpoch:
+class ResidualEpoch(Generic[S]):
     """Some iterations of a frame's residual, in the order in which they are made.
 
     Arguments:
@@ -85,19 +88,19 @@ class ResidualEpoch:
         begin: called with the position of each iteration before it is made, so that an error can name it.
     """
 
-    session: RenderSession
+    session: S
     iterations: Sequence[Iteration]
     gates: Gates
     rd_lambda: float
     begin: Callable[[int], None] = lambda _: None
 
-    def after(self, made: int) -> ResidualEpoch:
+    def after(self, made: int) -> ResidualEpoch[S]:
         """Return what is left after so many iterations; ``begin`` counts on."""
         begin = self.begin
         return replace(self, iterations=self.iterations[made:], begin=lambda place: begin(made + place))
 
 
-class ResidualOptimiser(ABC):
+class ResidualOptimiser(ABC, Generic[S]):
     """The residual of A rows in one frame's optimisation: latents behind linear decoders, gated, trained by Adam.
 
     It is ``gsstream.parts.residual.decode`` (rounding counts as the identity), the rate of
@@ -148,7 +151,7 @@ class ResidualOptimiser(ABC):
         Raises ShapeError where a gradient is not finite.
         """
 
-    def run(self, epoch: ResidualEpoch) -> list[torch.Tensor]:
+    def run(self, epoch: ResidualEpoch[S]) -> list[torch.Tensor]:
         """Make these iterations and return their losses [].
 
         This body is the truth. An optimiser may override it with one that does the same in one call, up to rounding,

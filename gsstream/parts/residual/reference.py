@@ -7,6 +7,7 @@ from typing import final
 import torch
 
 from gsstream.core.gaussians import Gaussians
+from gsstream.parts.render.session import RenderSession
 from gsstream.parts.residual.adam_state import RowSteps
 from gsstream.parts.residual.decode import add_joint, decode_joint, join_features, joint_vjp
 from gsstream.parts.residual.layout import JointLayout
@@ -16,7 +17,7 @@ from gsstream.parts.residual.row_parameters import RowParameters
 
 
 @final
-class JointResidualOptimiser(ResidualOptimiser):
+class JointResidualOptimiser(ResidualOptimiser[RenderSession]):
     """Calls the map of latents to attributes, its gradient, the rate's gradient and the row optimiser's ``step``."""
 
     def __init__(

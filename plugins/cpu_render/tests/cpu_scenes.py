@@ -10,7 +10,7 @@ from gsstream_cpu_render.arrays import SplatArrays, SplatGradients
 from gsstream_cpu_render.rasterizer import NumpyRasterizer
 
 from gsstream.api import Cameras, Gaussians
-from gsstream.parts.render.reference import composite, project
+from gsstream.parts.backend.reference import composite, project
 
 BACKGROUND = (0.2, 0.5, 0.9)
 WIDTH, HEIGHT = 49, 37  # neither a multiple of a block nor of a tile

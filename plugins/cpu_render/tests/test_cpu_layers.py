@@ -14,7 +14,8 @@ from gsstream_cpu_render.renderer import CpuRenderer
 from gsstream_cpu_render.session import CpuSession
 from test_cpu_renderer import rig
 
-from gsstream.api import CameraExposure, Gaussians, LossAndGrad, RenderSession, ViewTarget, WrtRows
+from gsstream.api import Gaussians, WrtRows
+from gsstream.backend import CameraExposure, LossAndGrad, RenderSession, ViewTarget
 
 Scene = Gaussians[torch.Tensor]
 COUNT = 700  # lists of some 150 entries a tile: several cells of the layers behind

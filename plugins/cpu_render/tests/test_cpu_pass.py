@@ -24,7 +24,7 @@ from gsstream.engine.step.problem import Problem, Solution
 from gsstream.input.recordings.open import open_source
 from gsstream.parts.gate.always_open import AlwaysOpen
 from gsstream.parts.regularizer.base import AnalyticPenalty
-from gsstream.parts.render.base import TILE
+from gsstream.parts.render.images import TILE
 from gsstream.recipe.load import resolve_recipe
 
 SOURCE = "synthetic:frames=3&views=3&width=64&height=48&supersample=1"

@@ -16,8 +16,9 @@ from gsstream_cpu_render import pool
 from gsstream_cpu_render.pool import release_idle_memory
 from gsstream_cpu_render.renderer import CpuRenderer
 
-from gsstream.api import Cameras, Gaussians, RenderOutput
-from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.api import Cameras, Gaussians
+from gsstream.backend import RenderOutput
+from gsstream.parts.backend.reference import ReferenceRenderer
 
 N = 120
 

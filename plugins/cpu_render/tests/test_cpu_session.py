@@ -12,7 +12,8 @@ from gsstream_cpu_render.renderer import CpuRenderer
 from test_cpu_fit import comparison
 from test_cpu_renderer import N, backpropagate, leaves, replaced, rig, scene, upstream
 
-from gsstream.api import Gaussians, InputError, RenderSession, WrtRows
+from gsstream.api import Gaussians, InputError, WrtRows
+from gsstream.backend import RenderSession
 
 Scene = Gaussians[torch.Tensor]
 

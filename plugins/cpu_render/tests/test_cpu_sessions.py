@@ -29,16 +29,9 @@ from test_cpu_fit import comparison, some_tiles
 from test_cpu_raster_properties import masked_pixels, random_mask
 from test_cpu_renderer import backpropagate, grads, leaves, replaced, rig, upstream
 
-from gsstream.api import (
-    Gaussians,
-    GroupTransforms,
-    LossAndGrad,
-    RenderOutput,
-    RenderSession,
-    WrtRows,
-    WrtScene,
-    WrtTransforms,
-)
+from gsstream.api import Gaussians, WrtRows, WrtTransforms
+from gsstream.backend import LossAndGrad, RenderOutput, RenderSession, WrtScene
+from gsstream.blocks import GroupTransforms
 
 Scene = Gaussians[torch.Tensor]
 #: Number of Gaussians, and whether they are opaque. A tile of the last has several cells of layers behind it.

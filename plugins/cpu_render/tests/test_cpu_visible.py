@@ -11,8 +11,9 @@ from cpu_scenes import BACKGROUND, HEIGHT, WIDTH, camera, random_splats
 from gsstream_cpu_render.rasterizer import NumpyRasterizer
 from gsstream_cpu_render.renderer import CpuRenderer
 
-from gsstream.api import Cameras, Gaussians, InputError, RenderSession, ScatterSession, ShapeError
-from gsstream.parts.render.reference import ReferenceRenderer, footprint_in_image
+from gsstream.api import Cameras, Gaussians, InputError, ShapeError
+from gsstream.backend import RenderSession, ScatterSession
+from gsstream.parts.backend.reference import ReferenceRenderer, footprint_in_image
 
 Scene = Gaussians[torch.Tensor]
 N = 150

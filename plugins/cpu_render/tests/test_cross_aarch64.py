@@ -21,7 +21,7 @@ from gsstream_cpu_render.arrays import SplatArrays
 from gsstream_cpu_render.loss import photometric_loss
 from gsstream_cpu_render.rasterizer import NumpyRasterizer
 
-from gsstream.api import AdamState
+from gsstream.backend import AdamState
 
 _spec = importlib.util.spec_from_file_location("cross_build", Path(__file__).parent / "cross" / "build.py")
 assert _spec is not None

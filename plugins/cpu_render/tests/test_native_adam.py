@@ -9,7 +9,8 @@ import pytest
 import torch
 from gsstream_cpu_render.adam_step import step_table
 
-from gsstream.api import ADAM_BETAS, ADAM_EPS, AdamState, InputError, ShapeError
+from gsstream.api import InputError, ShapeError
+from gsstream.backend import ADAM_BETAS, ADAM_EPS, AdamState
 
 
 def drawn(rng: np.random.Generator, *shape: int) -> torch.Tensor:

@@ -23,8 +23,9 @@ from test_cpu_pass import CASES, captured, solved
 from test_cpu_renderer import rig, scene
 from test_native_loss import near_pair
 
-from gsstream.api import AdamState, Gaussians, WrtScene
-from gsstream.testing.optimiser.checks import residual_case
+from gsstream.api import Gaussians
+from gsstream.backend import AdamState, WrtScene
+from gsstream.testing.optimiser import residual_case
 
 
 def rasterised() -> list[Any]:

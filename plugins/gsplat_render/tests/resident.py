@@ -12,9 +12,8 @@ from gsstream_gsplat_render.rig import rigs_on
 from torch_kernels import TORCH_KERNELS
 
 from gsstream.core.part import PartConfig
-from gsstream.parts.loss.photometric import ReferenceLoss
-from gsstream.parts.optimiser.adam import ReferenceAdam
-from gsstream.parts.render.base import Renderer, RenderOutput
+from gsstream.parts.backend.base import Renderer
+from gsstream.parts.render.session import RenderOutput
 from gsstream.testing import MethodUnderTest
 from gsstream.testing.pretend import DEVICE, kernel
 
@@ -46,7 +45,7 @@ def method_on(device: torch.device, name: str = "s2gs-fast") -> MethodUnderTest:
     """Return a method of the contract kit's size whose renderer works on a device."""
     under = MethodUnderTest(name)
     renderer = StandIn(StandIn.Config(place=str(device)))
-    under.assembly = replace(under.assembly, renderer=renderer, loss=ReferenceLoss(), optimiser=ReferenceAdam())
+    under.assembly = replace(under.assembly, renderer=renderer)
     return under
 
 

@@ -12,8 +12,9 @@ from gsstream_gsplat_render.renderer import GsplatRenderer, GsplatSession
 from gsstream_gsplat_render.rig import Rigs
 from torch_kernels import TORCH_KERNELS
 
-from gsstream.api import Cameras, Gaussians, PluginUnavailable, RenderOutput, ShapeError
-from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.api import Cameras, Gaussians, PluginUnavailable, ShapeError
+from gsstream.backend import RenderOutput
+from gsstream.parts.backend.reference import ReferenceRenderer
 from gsstream.testing import parametrize_with_checks
 
 N, WIDTH, HEIGHT = 120, 49, 37  # the size is no multiple of a tile

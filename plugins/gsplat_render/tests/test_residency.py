@@ -22,8 +22,8 @@ from gsstream.core.frame import Frame
 from gsstream.engine.frame0.optimise import FirstFrameRun
 from gsstream.engine.step import frame_step
 from gsstream.input.recordings.open import open_source
-from gsstream.parts.loss.photometric import ReferenceLoss
 from gsstream.parts.motion.newton import DampedNewton
+from gsstream.parts.render.loss import ReferenceLoss
 from gsstream.parts.residual.reference import JointResidualOptimiser
 from gsstream.testing.method_driver import SOURCE
 from gsstream.testing.pretend import PretendDevice

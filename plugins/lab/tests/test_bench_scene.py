@@ -32,7 +32,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsstream.core.gaussians import Gaussians
-from gsstream.parts.render.reference import ALPHA_CUT, ALPHA_MAX, TRANSMITTANCE_MIN, project
+from gsstream.parts.backend.reference import ALPHA_CUT, ALPHA_MAX, TRANSMITTANCE_MIN, project
 
 
 def scene(count: int = 300, seed: int = 0) -> Gaussians[np.ndarray]:

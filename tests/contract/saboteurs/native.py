@@ -1,26 +1,39 @@
-"""Saboteurs of the checks of update rules, losses and optimisers."""
+"""Saboteurs of the checks of update rules, and of what a renderer brings: its loss and its row optimiser."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
 import torch
 
-from gsstream.parts.loss.base import LossTraits
-from gsstream.parts.optimiser.adam import ReferenceAdam
+from gsstream.parts.backend.adam import ReferenceAdam
+from gsstream.parts.backend.reference import ReferenceRenderer
+from gsstream.parts.render.loss import ReferenceLoss
 from gsstream.parts.residual.layout import AttributeCode, JointLayout
 from gsstream.parts.residual.optimiser import ResidualEpoch, ResidualOptimiser
 from gsstream.parts.residual.reference import JointResidualOptimiser
 from gsstream.testing.examples.update import ExampleUpdate
-from gsstream.testing.loss.example import ExampleLoss
 from saboteurs.register import spoils
 
 # They are final; only a saboteur may inherit from them, and only behind the type checker's back.
 Update: Any = ExampleUpdate
-Loss: Any = ExampleLoss
+Reference: Any = ReferenceRenderer
+Loss: Any = ReferenceLoss
 Adam: Any = ReferenceAdam
+
+
+def brought(check: str) -> Callable[[type], type]:
+    """Enter a renderer with this loss, or this row optimiser, as the saboteur of a check."""
+
+    def enter(cls: type) -> type:
+        name = "loss" if issubclass(cls, ReferenceLoss) else "optimiser"
+        body = {name: property(lambda _: cls()), "__doc__": cls.__doc__, "__module__": __name__}
+        globals()[f"Brings{cls.__name__}"] = spoils(check)(type(f"Brings{cls.__name__}", (Reference,), body))
+        return cls
+
+    return enter
 
 
 @spoils("check_update_codes")
@@ -50,7 +63,7 @@ class Loud(Update):
         return {**codes, "sh0": replace(codes["sh0"], decoder_std=1e6)}
 
 
-@spoils("check_loss_reference")
+@brought("check_loss_reference")
 class AlwaysSome(Loss):
     """Never less than a tenth of L1, whatever the weight of SSIM."""
 
@@ -61,33 +74,29 @@ class AlwaysSome(Loss):
         return evaluated
 
 
-@spoils("check_loss_mask")
-class EmptyIsAll(Loss):
-    """Takes a mask without tiles for no mask."""
+@brought("check_loss_mask")
+class MeanOfMarked(Loss):
+    """Divides by the number of marked tiles, not by that of all."""
 
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        mask = tile_mask if tile_mask is not None and bool(tile_mask.any()) else None
-        evaluated: tuple[torch.Tensor, torch.Tensor] = super().evaluate(image, prepared, dssim, mask)
-        return evaluated
+        value, gradient = super().evaluate(image, prepared, dssim, tile_mask)
+        marked = 1.0 if tile_mask is None else max(float(tile_mask.float().mean()), 1 / tile_mask.numel())
+        return value / marked, gradient
 
 
-@spoils("check_loss_bytes")
+@brought("check_loss_bytes")
 class Shifted(Loss):
     """Takes 256 for the byte that means white."""
-
-    traits = LossTraits(takes_bytes=True)
 
     def prepare(self, target: torch.Tensor) -> Any:
         return super().prepare(target if target.is_floating_point() else target.float() / 256)
 
 
-@spoils("check_loss_pure")
+@brought("check_loss_pure")
 class Scribbler(Loss):
     """Darkens the image once it has compared it."""
-
-    traits = LossTraits()  # of no other check
 
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
@@ -97,7 +106,7 @@ class Scribbler(Loss):
         return evaluated
 
 
-@spoils("check_optimiser_adam")
+@brought("check_optimiser_adam")
 class Halved(Adam):
     """Rates by column count half."""
 
@@ -106,7 +115,7 @@ class Halved(Adam):
         super().step(values, gradients, states, halved)
 
 
-@spoils("check_optimiser_rows")
+@brought("check_optimiser_rows")
 class OneCount(Adam):
     """One count of steps for all rows."""
 
@@ -116,7 +125,7 @@ class OneCount(Adam):
         super().step(values, gradients, states, lrs)
 
 
-@spoils("check_optimiser_refuses")
+@brought("check_optimiser_refuses")
 class Forgiving(Adam):
     """Leaves a table out whose gradient is not finite, and says nothing."""
 
@@ -125,7 +134,7 @@ class Forgiving(Adam):
         super().step(values, sound, states, lrs)
 
 
-@spoils("check_residual_optimiser")
+@brought("check_residual_optimiser")
 class Hurried(Adam):
     """Its own residual optimiser learns at twice the rates."""
 
@@ -137,16 +146,16 @@ Joint: Any = JointResidualOptimiser
 
 
 class _Thaws(Joint):
-    def run(self, epoch: ResidualEpoch) -> list[torch.Tensor]:
+    def run(self, epoch: ResidualEpoch[Any]) -> list[torch.Tensor]:
         iterations = [now._replace(frozen=None) for now in epoch.iterations]
         losses: list[torch.Tensor] = super().run(replace(epoch, iterations=iterations))
         return losses
 
 
-@spoils("check_residual_optimiser_run")
+@brought("check_residual_optimiser_run")
 class Thawed(Adam):
     """Its own iterations train rows that are to wait."""
 
-    def residual_optimiser(self, code: JointLayout, *start: Any) -> ResidualOptimiser:
-        made: ResidualOptimiser = _Thaws(code, *start, self)
+    def residual_optimiser(self, code: JointLayout, *start: Any) -> ResidualOptimiser[Any]:
+        made: ResidualOptimiser[Any] = _Thaws(code, *start, self)
         return made

@@ -9,11 +9,12 @@ import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.context import ScreenGradient
-from gsstream.parts.render.base import RenderOutput, RenderSession, ScatterSession
-from gsstream.parts.render.reference import ReferenceRenderer
+from gsstream.parts.backend.base import ScatterSession
+from gsstream.parts.backend.reference import ReferenceRenderer
+from gsstream.parts.render.session import RenderOutput, RenderSession
 from gsstream.parts.render.target import ViewTarget
 from gsstream.parts.render.wrt import LossAndGrad, WrtRows, WrtScene, WrtTransforms
-from gsstream.testing.renderer.example import ExampleRenderer
+from gsstream.testing.examples.renderer import ExampleRenderer
 from saboteurs.register import spoils
 
 # The reference is final; only a saboteur may inherit from it, and only behind the type checker's back.

@@ -11,8 +11,8 @@ import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
-from gsstream.parts.render.base import Renderer
-from gsstream.parts.render.reference import ReferenceRenderer, evaluate_sh, project
+from gsstream.parts.backend.base import Renderer
+from gsstream.parts.backend.reference import ReferenceRenderer, evaluate_sh, project
 
 F, W, H = 20.0, 14, 10
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)

@@ -17,7 +17,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.engine.step.active.change import Change
 from gsstream.engine.step.active.change_on_device import votes_on_device
-from gsstream.parts.render.base import RenderSession
+from gsstream.parts.render.session import RenderSession
 
 #: Least share of the views a Gaussian projects into in which it must lie in or beside changed tiles.
 CHANGE_VOTES = 0.75

@@ -16,7 +16,7 @@ from gsstream.core.processors import processors
 from gsstream.core.shapes import BoolArray, FloatArray, IntArray
 from gsstream.core.storage import unpacked
 from gsstream.engine.step.active.blocks import BLOCK, changed_blocks
-from gsstream.parts.render.base import TILE
+from gsstream.parts.render.images import TILE
 
 #: Blocks of a 16 x 16 tile (of 16) that must exceed the threshold.
 MIN_BLOCKS = 2

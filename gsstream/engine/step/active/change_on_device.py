@@ -14,7 +14,7 @@ from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.active.blocks import BLOCK, LEAST_SIGMA, MOST_OF_ROUGHNESS, MOST_SIGMA
 from gsstream.engine.step.active.change import MIN_BLOCKS, Change, detect_changed_tiles
 from gsstream.metrics.noise import MAD_TO_SIGMA
-from gsstream.parts.render.base import TILE
+from gsstream.parts.render.images import TILE
 
 #: Blocks along a side of a tile.
 SIDE = TILE // BLOCK

@@ -1,4 +1,4 @@
-"""Adam by rows as a gsstream part."""
+"""Adam by rows, which the renderer `cpu` brings."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import final
 
 import torch
 
-from gsstream.api import AdamState, Gaussians, JointLayout, ResidualOptimiser, RowOptimiser
+from gsstream.api import Gaussians
+from gsstream.backend import AdamState, JointLayout, ResidualOptimiser, RowOptimiser
 from gsstream_cpu_render.adam_step import step_table
 from gsstream_cpu_render.residual import CpuResidualOptimiser
+from gsstream_cpu_render.session import CpuSession
 
 
 @final
 class CpuAdam(RowOptimiser):
     """Native and fused: one call per table, threaded where a table is large."""
-
-    source = "Adam (Kingma and Ba 2015)"
 
     def step(
         self,
@@ -30,5 +30,5 @@ class CpuAdam(RowOptimiser):
 
     def residual_optimiser(
         self, code: JointLayout, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor
-    ) -> ResidualOptimiser:
+    ) -> ResidualOptimiser[CpuSession]:
         return CpuResidualOptimiser(code, base, units, matrix)

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsstream.api import ADAM_BETAS, ADAM_EPS, AdamState
+from gsstream.backend import ADAM_BETAS, ADAM_EPS, AdamState
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.checks import native_array, refuse, refuse_value
 
@@ -14,7 +14,7 @@ from gsstream_cpu_render.checks import native_array, refuse, refuse_value
 def step_table(
     name: str, value: torch.Tensor, gradient: torch.Tensor, state: AdamState, lr: float | torch.Tensor
 ) -> None:
-    """Move one table ``value`` [n, ...] and its moments by its gradient; see ``gsstream.api.RowOptimiser.step``."""
+    """Move one table ``value`` [n, ...] and its moments by its gradient; see ``gsstream.backend.RowOptimiser.step``."""
     if gradient.shape != value.shape:
         refuse(f"gradient of {name}: expected shape {list(value.shape)}, got {list(gradient.shape)}")
     if value.numel() == 0:

@@ -7,7 +7,8 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from gsstream.api import ATTRIBUTES, Gaussians, RenderOutput
+from gsstream.api import ATTRIBUTES, Gaussians
+from gsstream.backend import RenderOutput
 from gsstream_cpu_render.arrays import SplatArrays
 from gsstream_cpu_render.checks import as_array
 from gsstream_cpu_render.pool import Passes

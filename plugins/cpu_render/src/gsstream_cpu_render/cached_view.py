@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsstream.api import Gaussians, LossAndGrad, ViewTarget
+from gsstream.api import Gaussians
+from gsstream.backend import LossAndGrad, ViewTarget
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays, raise_on_faults, require_splats
 from gsstream_cpu_render.autograd import splats_of

@@ -1,4 +1,4 @@
-"""The photometric loss as a gsstream part."""
+"""The photometric loss that the renderer `cpu` brings."""
 
 from __future__ import annotations
 
@@ -6,17 +6,13 @@ from typing import Any, final
 
 import torch
 
-from gsstream.api import COMPACT_PIXELS, Loss, LossTraits
+from gsstream.backend import COMPACT_PIXELS, Loss
 from gsstream_cpu_render.loss import PreparedImage, photometric_loss
 
 
 @final
 class CpuLoss(Loss):
     """Native (1 - w) L1 + w (1 - SSIM), 3DGS variant; equal to the reference to 1e-6, at a fraction of its time."""
-
-    source = "3DGS (Kerbl et al. 2023)"
-
-    traits = LossTraits(takes_bytes=True)
 
     def prepare(self, target: torch.Tensor) -> Any:
         compact = target.shape[0] * target.shape[1] >= COMPACT_PIXELS

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsstream.api import LossAndGrad, ViewTarget, WrtTransforms
+from gsstream.api import WrtTransforms
+from gsstream.backend import LossAndGrad, ViewTarget
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays
 from gsstream_cpu_render.loss import weighted

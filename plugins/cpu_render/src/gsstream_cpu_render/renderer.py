@@ -1,4 +1,8 @@
-"""The renderer `cpu` of gsstream: the native rasteriser behind torch's autograd. Imports torch, as the engine does."""
+"""The renderer `cpu` of gsstream: the native rasteriser behind torch's autograd, with its loss and its row optimiser.
+
+Renderer, sessions, loss and optimiser are one bundle: a session takes every target for one of :class:`CpuLoss`, and the
+residual optimiser every session for a :class:`CpuSession`, because the engine gives them no others.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +11,11 @@ from typing import final
 import torch
 from pydantic import Field
 
-from gsstream.api import Cameras, Gaussians, PartConfig, Renderer, RenderOutput, RenderSession
+from gsstream.api import Cameras, Gaussians, PartConfig
+from gsstream.backend import Loss, Renderer, RenderOutput, RenderSession, RowOptimiser
+from gsstream_cpu_render.adam_part import CpuAdam
 from gsstream_cpu_render.autograd import differentiable
+from gsstream_cpu_render.loss_part import CpuLoss
 from gsstream_cpu_render.pool import acquire_rasterizer
 from gsstream_cpu_render.session import CpuSession, FullPass
 from gsstream_cpu_render.threads import instruction_set
@@ -41,6 +48,14 @@ class CpuRenderer(Renderer):
     def __init__(self, config: PartConfig | None = None) -> None:
         super().__init__(config)
         instruction_set()  # a wrong GSSTREAM_ISA is an error here, not in the middle of a run
+
+    @property
+    def loss(self) -> Loss:
+        return CpuLoss()
+
+    @property
+    def optimiser(self) -> RowOptimiser:
+        return CpuAdam()
 
     def render(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, background: Background

@@ -1,4 +1,4 @@
-"""The residual of a frame's rows, fused and threaded (implements ``gsstream.api.ResidualOptimiser``)."""
+"""The residual of a frame's rows, fused and threaded (implements ``gsstream.backend.ResidualOptimiser``)."""
 
 from __future__ import annotations
 
@@ -7,19 +7,8 @@ from typing import final
 
 import torch
 
-from gsstream.api import (
-    ADAM_BETAS,
-    ADAM_EPS,
-    ATTRIBUTES,
-    AdamState,
-    AnalyticGate,
-    AnalyticPenalty,
-    Gaussians,
-    JointLayout,
-    ResidualEpoch,
-    ResidualOptimiser,
-    unwrapped,
-)
+from gsstream.api import ATTRIBUTES, AnalyticGate, AnalyticPenalty, Gaussians
+from gsstream.backend import ADAM_BETAS, ADAM_EPS, AdamState, JointLayout, ResidualEpoch, ResidualOptimiser
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.adam_step import step_table
 from gsstream_cpu_render.autograd import splats_of
@@ -29,7 +18,7 @@ from gsstream_cpu_render.session import CpuSession
 
 
 @final
-class CpuResidualOptimiser(ResidualOptimiser):
+class CpuResidualOptimiser(ResidualOptimiser[CpuSession]):
     """One native call for ``forward``, for ``backward`` and for an epoch; sums do not depend on the number of threads.
 
     Arguments:
@@ -103,7 +92,7 @@ class CpuResidualOptimiser(ResidualOptimiser):
         step_table("latents", self._latents.detach(), latents, state=self._states["latents"], lr=lrs)
         step_table("matrix", self._matrix, matrix, state=self._states["matrix"], lr=decoder_lrs)
 
-    def run(self, epoch: ResidualEpoch) -> list[torch.Tensor]:
+    def run(self, epoch: ResidualEpoch[CpuSession]) -> list[torch.Tensor]:
         made: list[torch.Tensor] = []
         match epoch.gates.gate.form(), epoch.gates.regularizer.form():
             case AnalyticGate() as gate, AnalyticPenalty() as penalty:
@@ -113,13 +102,13 @@ class CpuResidualOptimiser(ResidualOptimiser):
         left = epoch.after(len(made)) if made else epoch
         return made + super().run(left) if left.iterations else made
 
-    def _native_run(self, epoch: ResidualEpoch, gate: AnalyticGate, penalty: AnalyticPenalty) -> list[torch.Tensor]:
-        """Losses of the iterations up to one in which there is a fault; none where session or loss are not native."""
-        session, gates, iterations, code = unwrapped(epoch.session), epoch.gates, epoch.iterations, self._code
-        if not isinstance(session, CpuSession):
-            return []
+    def _native_run(
+        self, epoch: ResidualEpoch[CpuSession], gate: AnalyticGate, penalty: AnalyticPenalty
+    ) -> list[torch.Tensor]:
+        """Losses of the iterations up to one in which there is a fault; none where the session asks for single ones."""
+        gates, iterations, code = epoch.gates, epoch.iterations, self._code
         epoch.begin(0)
-        ready = session.fused_views([now.view for now in iterations], [now.target for now in iterations])
+        ready = epoch.session.fused_views([now.view for now in iterations], [now.target for now in iterations])
         if ready is None:
             return []
         views = [

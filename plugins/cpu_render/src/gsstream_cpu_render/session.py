@@ -10,11 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsstream.api import (
-    Cameras,
+from gsstream.api import Cameras, Gaussians, InputError, WrtRows, WrtTransforms
+from gsstream.backend import (
     G,
-    Gaussians,
-    InputError,
     LossAndGrad,
     RenderCache,
     RenderOutput,
@@ -23,18 +21,14 @@ from gsstream.api import (
     ScreenGradient,
     ViewTarget,
     Wrt,
-    WrtRows,
     WrtScene,
-    WrtTransforms,
     check_tiles,
-    unwrapped,
 )
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import SplatArrays
 from gsstream_cpu_render.autograd import differentiable, splats_of
 from gsstream_cpu_render.cached_view import CachedView, Ids, freeze_views, update_views
 from gsstream_cpu_render.checks import Float32, as_array
-from gsstream_cpu_render.loss_part import CpuLoss
 from gsstream_cpu_render.moved import loss_and_grad_of_transforms
 from gsstream_cpu_render.pool import Passes, PooledRasterizer, acquire_rasterizer
 from gsstream_cpu_render.view import Background
@@ -134,7 +128,7 @@ class CpuSession(RenderSession):
 
     def loss_and_grad(self, view: int, target: ViewTarget, wrt: Wrt[G]) -> LossAndGrad[G]:
         found: LossAndGrad[Any] | None = None
-        if type(unwrapped(target.loss)) is CpuLoss and self._order is None:
+        if self._order is None:
             narrowed = self._ids is not None
             match wrt:
                 case WrtRows(means2d=False) if narrowed:
@@ -162,10 +156,9 @@ class CpuSession(RenderSession):
         """The native rasterisers of these views, frozen to the active rows, and what they are compared with.
 
         None where iterations have to be made one by one: rows in no order, a wide session, in which nothing stands
-        still that could be left out, another loss, or caches that do not all fit into the budget.
+        still that could be left out, or caches that do not all fit into the budget.
         """
-        known = all(type(unwrapped(target.loss)) is CpuLoss for target in targets)
-        if self._ids is None or self._order is not None or not known:
+        if self._ids is None or self._order is not None:
             return None
         cached = [self._view(view) for view in views]
         freeze_views(cached, self._ids)

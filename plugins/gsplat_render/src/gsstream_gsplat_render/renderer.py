@@ -13,17 +13,8 @@ from typing import final
 import torch
 from pydantic import Field
 
-from gsstream.api import (
-    Cameras,
-    Gaussians,
-    PartConfig,
-    Renderer,
-    RenderOutput,
-    RenderSession,
-    ScreenGradient,
-    ShapeError,
-    drawn_rows,
-)
+from gsstream.api import Cameras, Gaussians, PartConfig, ShapeError
+from gsstream.backend import Renderer, RenderOutput, RenderSession, ScreenGradient, drawn_rows
 from gsstream_gsplat_render.kernels import Kernels, load_kernels
 from gsstream_gsplat_render.rig import Background, Rig, Rigs, Target, rigs_on
 from gsstream_gsplat_render.splat import Drawn, composite, draw, pixels, project, touched_tiles

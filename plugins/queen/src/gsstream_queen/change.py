@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import torch
 
-from gsstream.api import FrameTools, Renderer
+from gsstream.api import FrameTools
+from gsstream.backend import Renderer
 from gsstream.blocks import count_per_tile
 from gsstream_queen.settings import ChangeSettings
 

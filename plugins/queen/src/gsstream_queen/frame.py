@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import torch
 
-from gsstream.api import Cameras, FrameTools, Gaussians, Renderer, RenderSession, WrtRows
+from gsstream.api import Cameras, FrameTools, Gaussians, WrtRows
+from gsstream.backend import Renderer, RenderSession
 from gsstream.blocks import DensifyStatistics, rows_backward
 from gsstream_queen.densify import densify, densify_epochs
 from gsstream_queen.settings import QueenConfig

@@ -28,7 +28,7 @@ from gsstream.engine.state.stream_state import StreamState
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.metrics import peak_memory_mb, psnr
 from gsstream.packet import KeyState, PlayerState, StreamMeta, decode_packet, encode_key
-from gsstream.parts.render.base import TILE
+from gsstream.parts.render.images import TILE
 from gsstream.recipe.model import ComponentRef, Recipe
 from gsstream_lab.bench.scene import (
     OBJECT_CENTER,

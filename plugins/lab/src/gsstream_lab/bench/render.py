@@ -15,8 +15,9 @@ from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.discovery.catalog import Catalog
+from gsstream.parts.backend.base import Renderer
 from gsstream.parts.render import backward as known
-from gsstream.parts.render.base import Renderer, RenderOutput
+from gsstream.parts.render.session import RenderOutput
 from gsstream_lab.bench.native import NativeBench, find_native, measure_peaks
 from gsstream_lab.bench.roofline import (
     Footprints,

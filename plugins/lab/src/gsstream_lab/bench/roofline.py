@@ -17,8 +17,8 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray, IntArray
-from gsstream.parts.render.base import TILE
-from gsstream.parts.render.reference import ALPHA_CUT, ALPHA_MAX, TRANSMITTANCE_MIN, project
+from gsstream.parts.backend.reference import ALPHA_CUT, ALPHA_MAX, TRANSMITTANCE_MIN, project
+from gsstream.parts.render.images import TILE
 
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 FLOPS_PER_PAIR = (34, 80)

@@ -191,7 +191,6 @@ def _code_hash(parts: Assembly) -> str:
         parts.regularizer,
         parts.update,
         parts.renderer,
-        parts.loss,
     )
     digest = hashlib.sha256()
     for name in sorted({"gsstream", *(type(part).__module__.partition(".")[0] for part in used)}):

@@ -1,4 +1,8 @@
-"""Renderer: Gaussians and one camera in, an image and gradients out.
+"""Renderer: Gaussians and one camera in, an image and gradients out; and what else is computed where it works.
+
+A renderer brings the loss and the row optimiser that work beside it. They are no parts of their own, because all
+implementations give the same numbers and only those that know each other are fast together. The defaults are the
+reference ones, in torch on any device: a renderer that draws and nothing else is complete.
 
 Conventions: pixel-corner origin, 0.3 px screen-space blur, alpha cut at 1/255, alpha clamped at 0.999, a Gaussian
 counts while the transmittance before it exceeds 1e-4, near plane ``cameras.near_plane``. Tiles are 16 x 16 pixels.
@@ -7,20 +11,18 @@ counts while the transmittance before it exceeds 1e-4, near plane ``cameras.near
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.context import ScreenGradient
-from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.part import Part
-from gsstream.parts.render.session import TILE as TILE
-from gsstream.parts.render.session import RenderCache as RenderCache
-from gsstream.parts.render.session import RenderOutput as RenderOutput
-from gsstream.parts.render.session import RenderSession as RenderSession
+from gsstream.parts.backend.adam import ReferenceAdam
+from gsstream.parts.backend.row_optimiser import RowOptimiser
+from gsstream.parts.render.drawn import drawn_rows
+from gsstream.parts.render.loss import Loss, ReferenceLoss
+from gsstream.parts.render.session import RenderOutput, RenderSession
 
 
 class Renderer(Part):
@@ -30,6 +32,16 @@ class Renderer(Part):
     def device(self) -> torch.device:
         """Where it works fastest; the engine keeps its scene, targets and gradients there."""
         return torch.device("cpu")
+
+    @property
+    def loss(self) -> Loss:
+        """What renders are compared by: the one loss of every target that a session of this renderer is given."""
+        return ReferenceLoss()
+
+    @property
+    def optimiser(self) -> RowOptimiser:
+        """What moves rows: its residual optimisers are given sessions of this renderer and no others."""
+        return ReferenceAdam()
 
     @abstractmethod
     def render(
@@ -132,47 +144,3 @@ class ScatterSession(RenderSession):
 
     def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
         return self._renderer.open(gaussians, None, self._cameras, self._background)
-
-
-def drawn_rows(
-    render: Callable[[Gaussians[torch.Tensor]], RenderOutput],
-    gaussians: Gaussians[torch.Tensor],
-    size: tuple[int, int],
-    tiles: torch.Tensor,
-) -> torch.Tensor:
-    """Find by differentiation the rows drawn in marked tiles: ``RenderSession.visible`` of a differentiable renderer.
-
-    The derivative of the image by the colour of a Gaussian is the sum of its weights alpha * transmittance, which are
-    positive where it is drawn and zero elsewhere, so nothing can cancel. All are drawn in grey, because a colour that
-    is clamped at 0 has no derivative.
-
-    Arguments:
-        render: draws a whole scene; differentiable by its colours. gaussians: the scene, N rows.
-        size: (H, W) of the image, pixels. tiles: [ceil(H / 16), ceil(W / 16)] bool.
-
-    Returns:
-        [N] bool.
-
-    Raises:
-        ShapeError: ``tiles`` of another shape or dtype.
-    """
-    check_tiles(tiles, size)
-    inside = tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[: size[0], : size[1]]
-    fixed = gaussians.map(torch.Tensor.detach)
-    colours = torch.zeros_like(fixed.sh0).requires_grad_()
-    with torch.enable_grad():
-        image = render(replace(fixed, sh0=colours, shN=torch.zeros_like(fixed.shN))).image
-        if not image.requires_grad:  # nothing is drawn at all
-            return torch.zeros_like(fixed.opacities, dtype=torch.bool)
-        (weights,) = torch.autograd.grad(image, colours, inside[..., None].expand_as(image).to(image))
-    return (weights > 0).flatten(1).any(1)
-
-
-def check_tiles(tiles: torch.Tensor, size: tuple[int, int]) -> None:
-    """Raise ShapeError unless ``tiles`` is bool [ceil(H / 16), ceil(W / 16)] for an image of ``size`` (H, W)."""
-    wanted = [-(-side // TILE) for side in size]
-    if tiles.dtype != torch.bool or list(tiles.shape) != wanted:
-        raise ShapeError(
-            f"tiles: expected bool {wanted} ({TILE} x {TILE} pixel tiles of a {size[1]} x {size[0]} image), got "
-            f"{tiles.dtype} {list(tiles.shape)}; give one mark per tile"
-        )

@@ -1,11 +1,11 @@
-"""What an implementation of the loss promises: the value and the gradient of the reference."""
+"""What the loss of a renderer promises: the value and the gradient of the reference."""
 
 from __future__ import annotations
 
 import torch
 
-from gsstream.parts.loss.base import Loss
-from gsstream.parts.loss.photometric import ReferenceLoss
+from gsstream.parts.backend.base import Renderer
+from gsstream.parts.render.loss import Loss, ReferenceLoss
 from gsstream.testing.cases import fingerprint
 from gsstream.testing.compare import at_most, equal, finite, relative
 from gsstream.testing.registry import check
@@ -25,61 +25,65 @@ def _pair() -> tuple[torch.Tensor, torch.Tensor]:
     return image, target
 
 
-def _evaluate(part: Loss, dssim: float, mask: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+def _evaluate(loss: Loss, dssim: float, mask: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
     image, target = _pair()
-    return part.evaluate(image, part.prepare(target), dssim, mask)
+    return loss.evaluate(image, loss.prepare(target), dssim, mask)
 
 
-def _agrees(part: Loss, dssim: float, mask: torch.Tensor | None) -> None:
-    (value, gradient), (want, wanted) = _evaluate(part, dssim, mask), _evaluate(ReferenceLoss(), dssim, mask)
+def _agrees(loss: Loss, dssim: float, mask: torch.Tensor | None) -> None:
+    (value, gradient), (want, wanted) = _evaluate(loss, dssim, mask), _evaluate(ReferenceLoss(), dssim, mask)
     off = abs(value - want)
     assert off <= 1e-5, f"dssim {dssim}: expected a loss of {want:.7f}, got {value:.7f} (tolerance 1e-5: float32)"
     relative(f"dssim {dssim}: gradient", gradient, wanted, tolerance=2e-3, why=WHY, floor=1e-5)
 
 
-@check("loss")
-def check_loss_reference(part: Loss) -> None:
+@check("renderer")
+def check_loss_reference(part: Renderer) -> None:
     """Value and gradient are those of (1 - w) L1 + w (1 - SSIM) at w = 0, 0.2 and 1."""
     for dssim in (0.0, 0.2, 1.0):
-        _agrees(part, dssim, None)
+        _agrees(part.loss, dssim, None)
 
 
-@check("loss")
-def check_loss_mask(part: Loss) -> None:
+@check("renderer")
+def check_loss_mask(part: Renderer) -> None:
     """With a mask of tiles the sum runs over them and those beside; a full mask equals no mask; none is 0."""
     one = torch.zeros(3, 3, dtype=torch.bool)
     one[0, 0] = True
-    _agrees(part, 0.2, one)
-    (value, gradient), (full, whole) = _evaluate(part, 0.2), _evaluate(part, 0.2, torch.ones(3, 3, dtype=torch.bool))
+    _agrees(part.loss, 0.2, one)
+    (value, gradient), (full, whole) = (
+        _evaluate(part.loss, 0.2),
+        _evaluate(part.loss, 0.2, torch.ones(3, 3, dtype=torch.bool)),
+    )
     assert abs(value - full) <= 1e-6, f"a full mask: expected {value:.7f} as without, got {full:.7f}"
     equal("gradient with a full mask", whole, gradient, tolerance=1e-6, why=WHY)
-    nothing, still = _evaluate(part, 0.2, torch.zeros(3, 3, dtype=torch.bool))
+    nothing, still = _evaluate(part.loss, 0.2, torch.zeros(3, 3, dtype=torch.bool))
     assert nothing == 0.0, f"an empty mask: expected a loss of exactly 0, got {nothing!r}"
     at_most("gradient with an empty mask", still.abs(), 0.0, tolerance=0.0, why="no tile is compared")
 
 
-@check("loss", "takes_bytes")
-def check_loss_bytes(part: Loss) -> None:
+@check("renderer")
+def check_loss_bytes(part: Renderer) -> None:
     """A target of bytes is the image that it stands for, bit for bit."""
     image, target = _pair()
     codes = (target * 255).round().to(torch.uint8)
     (value, gradient), (want, wanted) = (
-        part.evaluate(image, part.prepare(kind), 0.2) for kind in (codes, codes.float() / codes.new_tensor(255.0))
+        part.loss.evaluate(image.clone(), part.loss.prepare(kind), 0.2)
+        for kind in (codes, codes.float() / codes.new_tensor(255.0))
     )
     assert value == want, f"expected the loss of float32, {want!r}, got {value!r} for bytes"
     equal("gradient", gradient, wanted)
 
 
-@check("loss")
-def check_loss_pure(part: Loss) -> None:
+@check("renderer")
+def check_loss_pure(part: Renderer) -> None:
     """Images come out as they went in, a prepared target serves again, and nothing hangs on a graph."""
-    image, target = _pair()
+    loss, (image, target) = part.loss, _pair()
     before = fingerprint((image, target))
-    prepared = part.prepare(target)
+    prepared = loss.prepare(target)
     leaf = image.clone().requires_grad_()
-    first, gradient = part.evaluate(leaf, prepared, 0.2)
+    first, gradient = loss.evaluate(leaf, prepared, 0.2)
     kept = gradient.clone()
-    second, again = part.evaluate(image, prepared, 0.2)
+    second, again = loss.evaluate(image, prepared, 0.2)
     assert fingerprint((image, target)) == before, "the image or the target was changed in place"
     assert leaf.grad is None and not gradient.requires_grad, "a gradient was left behind, or carries a graph"
     assert first == second, f"the second evaluation gives {second!r}, the first gave {first!r}"

@@ -11,7 +11,7 @@ import torch
 from gsstream.core.deferred import require
 from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import check_finite, check_shape
-from gsstream.parts.optimiser.base import RowOptimiser
+from gsstream.parts.backend.row_optimiser import RowOptimiser
 from gsstream.parts.residual.adam_state import ADAM_BETAS, ADAM_EPS, MAX_GRADIENT, AdamState
 
 #: Number of steps from which on both corrections are 1 in float32.
@@ -21,8 +21,6 @@ SATURATED = 1 << 15
 @final
 class ReferenceAdam(RowOptimiser):
     """A dozen torch calls per table, on its device."""
-
-    source = "Adam (Kingma and Ba 2015)"
 
     def step(
         self,

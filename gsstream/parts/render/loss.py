@@ -1,4 +1,4 @@
-"""(1 - w) L1 + w (1 - SSIM) in plain torch: the truth for faster implementations.
+"""Loss: (1 - w) L1 + w (1 - SSIM) and its gradient by the image; the contract, and the reference in plain torch.
 
 SSIM is the 3DGS variant: 11 x 11 Gaussian window, sigma 1.5, zero padding, mean over pixels and channels (Kerbl et al.
 2023; Wang et al. 2004).
@@ -7,6 +7,7 @@ SSIM is the 3DGS variant: 11 x 11 Gaussian window, sigma 1.5, zero padding, mean
 from __future__ import annotations
 
 import functools
+from abc import ABC, abstractmethod
 from typing import Any, NamedTuple, final
 
 import torch
@@ -14,9 +15,8 @@ from torch.nn.functional import conv2d
 
 from gsstream.core.deferred import require
 from gsstream.core.errors import ShapeError
-from gsstream.parts.loss.base import Loss
+from gsstream.parts.render.images import float_image, spread_to_pixels
 
-TILE = 16
 WINDOW, SIGMA = 11, 1.5
 #: Wang et al.: (0.01 L)^2 and (0.03 L)^2 for values from 0 to L = 1.
 C1, C2 = 0.01**2, 0.03**2
@@ -31,14 +31,44 @@ class PreparedTarget(NamedTuple):
     variance: torch.Tensor
 
 
+class Loss(ABC):
+    """(1 - w) L1 + w (1 - SSIM) of an image and its gradient by the image, without an autograd graph.
+
+    Every implementation gives the numbers of :class:`ReferenceLoss`, up to rounding: make yours faster, not different.
+    ``prepare`` is called once per target and frame, ``evaluate`` once per iteration.
+    """
+
+    @abstractmethod
+    def prepare(self, target: torch.Tensor) -> Any:
+        """Precompute what depends only on the target; opaque to the engine.
+
+        Arguments:
+            target: [H, W, 3] float32 in [0, 1], or uint8 of which 255 is 1.0: the same image, bit for bit.
+        """
+
+    @abstractmethod
+    def evaluate(
+        self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the loss of ``image`` [H, W, 3] as a tensor [], on the CPU float64, and its gradient [H, W, 3].
+
+        Arguments:
+            image: [H, W, 3] rendered.
+            prepared: what :meth:`prepare` returned of the target.
+            dssim: weight w of 1 - SSIM, 0 to 1.
+            tile_mask: [ceil(H / 16), ceil(W / 16)] bool, tiles to evaluate; None: all. The sum runs over these tiles
+                and their neighbours, whose SSIM windows overlap them, divided by the number of pixels of the image.
+                In these tiles the gradient is that of the whole loss; elsewhere it is 0. ``image`` must be valid in
+                the neighbours too.
+        """
+
+
 @final
 class ReferenceLoss(Loss):
     """Separable SSIM with its gradient written out, on the device of the image."""
 
-    source = "3DGS (Kerbl et al. 2023)"
-
     def prepare(self, target: torch.Tensor) -> Any:
-        planes = target.permute(2, 0, 1)[:, None].contiguous()
+        planes = float_image(target).permute(2, 0, 1)[:, None].contiguous()
         mean, square = _windowed(torch.cat([planes, planes * planes])).chunk(2)
         energy = mean * mean
         return PreparedTarget(planes, mean, energy + C1, square - energy + C2)
@@ -110,5 +140,4 @@ def _with_neighbours(tile_mask: torch.Tensor) -> torch.Tensor:
 
 def _pixel_weight(image: torch.Tensor, tile_mask: torch.Tensor) -> torch.Tensor:
     """[H, W]: 1 in marked tiles, else 0."""
-    height, width = image.shape[:2]
-    return tile_mask.to(image.dtype).repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
+    return spread_to_pixels(tile_mask.to(image.dtype), *image.shape[:2])

@@ -7,13 +7,17 @@ from dataclasses import replace
 import torch
 
 from gsstream.core.cameras import Cameras
+from gsstream.parts.backend.base import Renderer
+from gsstream.parts.backend.reference import ALPHA_CUT, project
 from gsstream.parts.render.backward import gradient_of
-from gsstream.parts.render.base import TILE, Renderer, RenderOutput
-from gsstream.parts.render.reference import ALPHA_CUT, project
+from gsstream.parts.render.images import TILE
+from gsstream.parts.render.session import RenderOutput
+from gsstream.testing import loss as loss  # the checks of these three register themselves
+from gsstream.testing import loss_and_grad as loss_and_grad
+from gsstream.testing import optimiser as optimiser
 from gsstream.testing.cases import BLACK, RENDERER, SIZE, Scene, fingerprint, get_case
 from gsstream.testing.compare import EXACT, at_most, equal, finite, gradients_equal, relative
 from gsstream.testing.registry import check
-from gsstream.testing.renderer import loss_and_grad as loss_and_grad  # its checks register themselves
 
 WORLDS = ("empty", "one", "two identical", "line", "cloud", "far", "tiny", "vast", "thin", "unseen")
 GREY = (0.2, 0.5, 0.9)

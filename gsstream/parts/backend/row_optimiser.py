@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.part import Part
 from gsstream.parts.residual.adam_state import AdamState
 from gsstream.parts.residual.layout import JointLayout
 from gsstream.parts.residual.optimiser import ResidualOptimiser
 from gsstream.parts.residual.reference import JointResidualOptimiser
 
 
-class RowOptimiser(Part):
+class RowOptimiser(ABC):
     """Adam (Kingma and Ba 2015, algorithm 1; betas 0.9 / 0.999, eps 1e-15) with each row's bias corrected by its count.
 
     Where all rows take all steps this is ``torch.optim.Adam``, to 1e-6.
@@ -45,8 +45,10 @@ class RowOptimiser(Part):
 
     def residual_optimiser(
         self, code: JointLayout, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor
-    ) -> ResidualOptimiser:
+    ) -> ResidualOptimiser[Any]:
         """Return the optimiser of a frame's residual, from zero latents on. By default it is made of :meth:`step`.
+
+        Its epochs have sessions of the renderer that brings this optimiser.
 
         Arguments:
             code: columns of the attributes.

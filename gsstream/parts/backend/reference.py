@@ -16,8 +16,9 @@ from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.part import PartConfig
 from gsstream.core.shapes import check_finite
+from gsstream.parts.backend.base import Renderer, ScatterSession
 from gsstream.parts.render.activations import activate_opacities, activate_scales, rotation_matrices
-from gsstream.parts.render.base import Renderer, RenderOutput, ScatterSession
+from gsstream.parts.render.session import RenderOutput
 
 BLUR = 0.3
 ALPHA_CUT = 1 / 255

@@ -12,11 +12,11 @@ import torch
 from gsstream.core.changes.motion import GroupTransforms
 from gsstream.core.errors import ComponentError, ShapeError
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
-from gsstream.discovery.catalog import load_catalog
-from gsstream.parts.loss.base import Loss
-from gsstream.parts.loss.photometric import ReferenceLoss
-from gsstream.parts.render.base import TILE, Renderer, RenderSession
+from gsstream.parts.backend.base import Renderer
 from gsstream.parts.render.exposure import CameraExposure
+from gsstream.parts.render.images import TILE
+from gsstream.parts.render.loss import Loss
+from gsstream.parts.render.session import RenderSession
 from gsstream.parts.render.target import ViewTarget
 from gsstream.parts.render.wrt import LossAndGrad, Wrt, WrtRows, WrtScene, WrtTransforms
 from gsstream.testing.cases import SIZE, Scene, fingerprint, get_case
@@ -35,13 +35,6 @@ GREY = (0.2, 0.5, 0.9)
 TILES = -(-SIZE // TILE)
 
 
-def losses() -> Iterator[tuple[str, Loss]]:
-    """Yield every loss that is installed, by name."""
-    catalog = load_catalog()
-    for name in catalog.names("loss"):
-        yield name, catalog.resolve("loss", name)()
-
-
 def targets(loss: Loss) -> Iterator[tuple[str, ViewTarget]]:
     """Yield what a view may be compared with: with and without a colour map, with all tiles, some, and weights.
 
@@ -56,12 +49,11 @@ def targets(loss: Loss) -> Iterator[tuple[str, ViewTarget]]:
             yield colours + tiles, replace(seen, tile_weights=weights)
 
 
-def cases() -> Iterator[tuple[str, int, ViewTarget]]:
-    """Yield every loss that is installed with every kind of target, for two cameras in turns."""
-    for name, loss in losses():
-        for place, (kind, target) in enumerate(targets(loss)):
-            view = (place + place // 3) % 2
-            yield f"loss {name!r}, camera {view}{kind}", view, target
+def cases(part: Renderer) -> Iterator[tuple[str, int, ViewTarget]]:
+    """Yield every kind of target of the renderer's loss, for two cameras in turns."""
+    for place, (kind, target) in enumerate(targets(part.loss)):
+        view = (place + place // 3) % 2
+        yield f"camera {view}{kind}", view, target
 
 
 def narrowed(part: Renderer) -> tuple[RenderSession, Scene]:
@@ -105,7 +97,7 @@ def check_renderer_loss_and_grad(part: Renderer) -> None:
     """A narrowed session's own ``loss_and_grad`` gives what the default body gives, by rows and by transforms."""
     if type(narrowed(part)[0]).loss_and_grad is RenderSession.loss_and_grad:
         return
-    for what, view, target in cases():
+    for what, view, target in cases(part):
         session, rows = narrowed(part)
         some: tuple[Wrt[Any], ...] = WrtRows(rows), WrtTransforms(rows, transforms(len(rows)), curvature=True)
         for wrt in some:
@@ -121,7 +113,7 @@ def check_renderer_loss_and_grad_scene(part: Renderer) -> None:
     session = part.open(case.gaussians, None, case.cameras, GREY)
     if type(session).loss_and_grad is RenderSession.loss_and_grad:
         return
-    for what, view, target in cases():
+    for what, view, target in cases(part):
         wrt = WrtScene(case.gaussians)
         try:
             want = RenderSession.loss_and_grad(session, view, target, wrt)
@@ -138,19 +130,18 @@ def check_renderer_loss_and_grad_kept(part: Renderer) -> None:
     keep = torch.rand(len(case.gaussians), generator=torch.Generator().manual_seed(8)) < 0.7
     less = case.gaussians.rows(keep)
     session, without = (part.open(rows, None, case.cameras, GREY) for rows in (case.gaussians, less))
-    for name, loss in losses():
-        what, target = f"WrtScene, loss {name!r}, some rows kept", ViewTarget(loss, loss.prepare(IMAGE), 0.2, IMAGE)
-        found = session.loss_and_grad(0, target, WrtScene(case.gaussians, means2d=False, keep=keep))
-        want = without.loss_and_grad(0, target, WrtScene(less, means2d=False))
-        compare(what, replace(found, grad=found.grad.rows(keep), exposure=want.exposure), want, 1e-5)
-        for attribute, value in found.grad.rows(~keep).items():
-            at_most(f"{what}: gradient of {attribute} of the others", value.abs(), 0.0, tolerance=0.0, why=EXACT)
+    what, target = "WrtScene, some rows kept", ViewTarget(part.loss, part.loss.prepare(IMAGE), 0.2, IMAGE)
+    found = session.loss_and_grad(0, target, WrtScene(case.gaussians, means2d=False, keep=keep))
+    want = without.loss_and_grad(0, target, WrtScene(less, means2d=False))
+    compare(what, replace(found, grad=found.grad.rows(keep), exposure=want.exposure), want, 1e-5)
+    for attribute, value in found.grad.rows(~keep).items():
+        at_most(f"{what}: gradient of {attribute} of the others", value.abs(), 0.0, tolerance=0.0, why=EXACT)
 
 
 @check("renderer")
 def check_renderer_grad(part: Renderer) -> None:
     """Gradients repeat bit for bit, leave rows and graphs alone, add up over tiles, and are 0 where nothing counts."""
-    loss = ReferenceLoss()
+    loss = part.loss
     target = ViewTarget(loss, loss.prepare(IMAGE), 0.0, IMAGE)  # without SSIM, every pixel speaks for itself
     session, rows = narrowed(part)
     leaves = rows.map(lambda value: value.clone().requires_grad_())
@@ -183,7 +174,7 @@ def check_renderer_grad(part: Renderer) -> None:
 def check_renderer_grad_unseen(part: Renderer) -> None:
     """Rows that are not in view have a gradient of exactly 0, alone and as a whole scene."""
     case = get_case("unseen")
-    loss = ReferenceLoss()
+    loss = part.loss
     target = ViewTarget(loss, loss.prepare(IMAGE), 0.2, IMAGE)
     hidden = (case.gaussians.means[:, 1] > 10).nonzero()[:, 0]
     session = part.open(case.gaussians, None, case.cameras, GREY)
@@ -198,7 +189,7 @@ def check_renderer_grad_unseen(part: Renderer) -> None:
 @check("renderer")
 def check_renderer_grad_refuses(part: Renderer) -> None:
     """A value that is not finite is refused, in whatever attribute it is."""
-    loss = ReferenceLoss()
+    loss = part.loss
     target = ViewTarget(loss, loss.prepare(IMAGE), 0.2, IMAGE)
     for name in ATTRIBUTES:
         session, rows = narrowed(part)

@@ -7,7 +7,8 @@ from typing import final
 import torch
 from pydantic import Field
 
-from gsstream.api import Cameras, Gaussians, PartConfig, Renderer, RenderOutput, ScreenGradient
+from gsstream.api import Cameras, Gaussians, PartConfig
+from gsstream.backend import Renderer, RenderOutput, ScreenGradient
 from gsstream.testing.cases import RENDERER
 
 
@@ -15,7 +16,7 @@ from gsstream.testing.cases import RENDERER
 class ExampleRenderer(Renderer):
     """The reference renderer in another coat; put calls of your library in its place.
 
-    Sessions, masks and caches have defaults that are right and slow: ``gsstream/parts/render/base.py`` describes
+    Sessions, masks and caches have defaults that are right and slow: ``gsstream/parts/backend/base.py`` describes
     what to override.
     """
 

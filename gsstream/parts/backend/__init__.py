@@ -1,0 +1,1 @@
+"""What computes: a renderer with its loss and its row optimiser."""

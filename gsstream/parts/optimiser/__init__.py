@@ -1,1 +1,0 @@
-"""Optimisers of table rows: how a gradient moves what is trained."""

@@ -1,1 +1,0 @@
-"""What every row optimiser promises."""

@@ -1,4 +1,4 @@
-"""The page of the front doors ``api``, ``blocks``, ``encode`` and ``play``: every exported name with its signature."""
+"""The page of the front doors of scripts and plugins: every exported name with its signature."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from tools.reference.text import NOTE, cell, signature
 #: The modules that scripts and plugins may import, and who they are for.
 DOORS = {
     "api": "What a plugin imports: records and contracts. Imports torch.",
+    "backend": "What a renderer imports, and what it may bring: a loss and a row optimiser. Imports torch.",
     "blocks": "Functions that the engine itself is built from, for methods of other kinds. Imports torch.",
     "encode": "What a script imports to encode: frames in, packets out. Imports torch.",
     "play": "What a script imports to play: packets in, Gaussians and pictures out. Imports no torch.",

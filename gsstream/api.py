@@ -6,7 +6,6 @@ Importing this module imports torch (the parts are torch code); ``gsstream.spec`
 from gsstream.core.cameras import Cameras as Cameras
 from gsstream.core.changes import AddedGaussians as AddedGaussians
 from gsstream.core.changes import Delta as Delta
-from gsstream.core.changes import Displacement as Displacement
 from gsstream.core.changes import Field as Field
 from gsstream.core.changes import FieldShape as FieldShape
 from gsstream.core.changes import Layout as Layout
@@ -32,7 +31,6 @@ from gsstream.core.gaussians import ATTRIBUTES as ATTRIBUTES
 from gsstream.core.gaussians import Gaussians as Gaussians
 from gsstream.core.hierarchy import Hierarchy as Hierarchy
 from gsstream.core.hierarchy import tree_max as tree_max
-from gsstream.core.log import FrameLog as FrameLog
 from gsstream.core.part import PartConfig as PartConfig
 from gsstream.core.rng import Rng as Rng
 from gsstream.core.shapes import FloatArray as FloatArray

@@ -6,9 +6,13 @@ Records that all parts share (``Gaussians``, ``Cameras``) come from ``gsstream.a
 
 from gsstream.core.context import RowGradient as RowGradient
 from gsstream.core.context import ScreenGradient as ScreenGradient
+from gsstream.core.median import median as median
 from gsstream.core.picture_size import COMPACT_PIXELS as COMPACT_PIXELS
 from gsstream.parts.backend.base import Renderer as Renderer
 from gsstream.parts.backend.base import ScatterSession as ScatterSession
+from gsstream.parts.backend.change import Change as Change
+from gsstream.parts.backend.change import ChangeRule as ChangeRule
+from gsstream.parts.backend.change import changed_tiles as changed_tiles
 from gsstream.parts.backend.row_optimiser import RowOptimiser as RowOptimiser
 from gsstream.parts.render.drawn import drawn_rows as drawn_rows
 from gsstream.parts.render.exposure import CameraExposure as CameraExposure

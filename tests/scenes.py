@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsstream.api import ATTRIBUTES, Cameras, Displacement, FrameLog, Gaussians, Layout, Scene
+from gsstream.api import ATTRIBUTES, Cameras, Gaussians, Layout, Scene
 from gsstream.backend import LossAndGrad, ScreenGradient, Wrt
+from gsstream.core.changes import Displacement
+from gsstream.core.log import FrameLog
 from gsstream.testing import World
 
 #: Two cameras in one place.

@@ -12,10 +12,11 @@ from gsstream.core.frame import Frame
 from gsstream.core.log import FrameLog
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
+from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.engine.state.stream_state import StreamState
-from gsstream.engine.step.active.change import Change, detect_changed_tiles
 from gsstream.engine.step.context import EngineContext
 from gsstream.packet import PlayerState
+from gsstream.parts.backend.change import Change, find_change
 from gsstream.parts.motion.base import MotionPart
 from gsstream.testing.cases import flat, rig, scene
 from gsstream.testing.method_driver import MethodUnderTest
@@ -88,8 +89,8 @@ def _work(before: Scene, shift: FloatArray, *, everywhere: bool) -> FitFixture:
         return replace(blank, images=np.stack(images))
 
     previous, frame = pictures(before.gaussians.means), pictures(before.gaussians.means + shift)
-    change = detect_changed_tiles(previous, frame, THRESHOLD)
-    assert change is not None
+    shown, now = (FrameImages(each.images, torch.device("cpu")).all_stored() for each in (previous, frame))
+    change = find_change(shown, now, THRESHOLD)
     if everywhere:
         change = Change(torch.ones_like(change.tiles), change.height, change.width)
     return FitFixture(before, context(previous, frame, change), Rng(assembly.recipe.seed))

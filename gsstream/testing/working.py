@@ -13,11 +13,12 @@ from gsstream.core.changes import Scene
 from gsstream.core.log import FrameLog
 from gsstream.core.part import Part
 from gsstream.core.rng import Rng
+from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.engine.run.encoder import EncodedFrame
-from gsstream.engine.step.active.change import Change, detect_changed_tiles
 from gsstream.engine.step.context import EngineContext
 from gsstream.input.recordings.open import open_source
 from gsstream.metrics.psnr import psnr
+from gsstream.parts.backend.change import Change, find_change
 from gsstream.player.render import named_renderer, render
 from gsstream.testing.method_driver import FRAMES, SOURCE, MethodUnderTest, check_replay
 
@@ -46,8 +47,8 @@ def fit_fixture(*, changed: bool = True) -> FitFixture:
     """Return frame 2 of a tiny recording, to be worked on; with ``changed`` false no tile counts as changed."""
     method, step = _before()
     state, frame = step.state, open_source(SOURCE).frame(2)
-    change = detect_changed_tiles(state.previous, frame, THRESHOLD)
-    assert change is not None
+    before, now = (FrameImages(each.images, torch.device("cpu")).all_stored() for each in (state.previous, frame))
+    change = find_change(before, now, THRESHOLD)
     if not changed:
         change = Change(torch.zeros_like(change.tiles), change.height, change.width)
     frame = replace(frame, index=INDEX, cameras=state.previous.cameras)

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.engine.step.active.candidates import VoteCache, candidates, changed_rows, keep_mask
-from gsstream.engine.step.active.change import Change
+from gsstream.engine.step.candidates import candidates, keep_mask
 from gsstream.parts.backend.base import ScatterSession
+from gsstream.parts.backend.change import Change
 from gsstream.parts.backend.reference import ReferenceRenderer
 from gsstream.parts.render.images import TILE
 from gsstream.parts.render.session import RenderSession
@@ -77,7 +77,7 @@ def test_changed_rows_are_those_seen_in_changed_tiles_with_enough_votes(
     session = SaidToBeSeen(torch.from_numpy(rng.random((views, 30)) < 0.6))
     least = data.draw(st.sampled_from([0.0, 0.3, 0.5, 0.99]))
     cameras = rig(views)
-    found = changed_rows(Change(tiles, HEIGHT, WIDTH), torch.from_numpy(means), cameras, session, least)
+    found = Change(tiles, HEIGHT, WIDTH).rows(torch.from_numpy(means), cameras, session, least)
     changed = [view for view in range(views) if bool(tiles[view].any())]
     expected = [
         any(bool(session.seen[view, row]) for view in changed)
@@ -88,18 +88,12 @@ def test_changed_rows_are_those_seen_in_changed_tiles_with_enough_votes(
     assert session.asked == changed
 
 
-def test_without_a_detection_everything_counts_and_nobody_is_asked() -> None:
-    session = SaidToBeSeen(torch.zeros(2, 5, dtype=torch.bool))
-    assert changed_rows(None, torch.zeros(5, 3), rig(2), session, 1.0).tolist() == [True] * 5
-    assert session.asked == []
-
-
 @pytest.mark.parametrize("number", [0, 1])
 def test_few_rows(number: int) -> None:
     tiles = torch.ones(2, 3, 4, dtype=torch.bool)
     session = SaidToBeSeen(torch.ones(2, number, dtype=torch.bool))
     means = torch.tensor([[0.0, 0.0, 2.0]])[:number]
-    assert changed_rows(Change(tiles, HEIGHT, WIDTH), means, rig(2), session, 1.0).tolist() == [True] * number
+    assert Change(tiles, HEIGHT, WIDTH).rows(means, rig(2), session, 1.0).tolist() == [True] * number
 
 
 def test_what_is_seen_in_a_changed_tile_is_what_changes_its_pixels() -> None:
@@ -110,7 +104,7 @@ def test_what_is_seen_in_a_changed_tile_is_what_changes_its_pixels() -> None:
     tiles[0, 1, 1] = tiles[1, 0, 3] = True
     renderer = ReferenceRenderer()
     session = ScatterSession(renderer, gaussians, None, cameras, BLACK)
-    found = changed_rows(Change(tiles, HEIGHT, WIDTH), means, cameras, session, 0.0)
+    found = Change(tiles, HEIGHT, WIDTH).rows(means, cameras, session, 0.0)
     for row in range(25):
         less = gaussians.rows(torch.tensor([other for other in range(25) if other != row]))
         changes = False
@@ -122,24 +116,6 @@ def test_what_is_seen_in_a_changed_tile_is_what_changes_its_pixels() -> None:
         # A row that lies behind opaque ones is seen by the session and changes nothing: never the other way round.
         assert bool(found[row]) or not changes, row
     assert 0 < int(found.sum()) < 25, "a rig that sees all or nothing proves nothing"
-
-
-@given(seed=st.integers(0, 999), moved=st.integers(0, 40), grown=st.booleans())
-def test_votes_that_are_known_are_those_counted_anew(seed: int, moved: int, grown: bool) -> None:
-    """Asked about some rows, then about others of the scene after a motion, or of one with another number of rows."""
-    rng = np.random.default_rng(seed)
-    means = torch.from_numpy(rng.uniform([-4, -3, -1], [4, 3, 6], (40, 3)).astype(np.float32))
-    change = Change(torch.from_numpy(rng.random((3, 3, 4)) < 0.3), HEIGHT, WIDTH)
-    book = VoteCache(change, rig(3))
-    after = means.clone()
-    after[rng.permutation(40)[:moved]] += 1.0
-    if grown:
-        after = torch.cat([after, after[:5] + 0.5])
-    for some in (means, after, after):
-        rows = torch.from_numpy(np.sort(rng.permutation(len(some))[: rng.integers(0, len(some) + 1)]))
-        found = book.of(some, rows)
-        assert found.dtype == torch.float32
-        assert found.tolist() == change.votes(some[rows], rig(3)).tolist()
 
 
 @given(nodes=st.integers(1, 6), rows=st.integers(0, 20), seed=st.integers(0, 999), threshold=st.sampled_from([0, 0.25]))

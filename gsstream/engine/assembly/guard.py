@@ -17,14 +17,16 @@ from gsstream.core.part import unwrapped
 from gsstream.engine.assembly.checks import Checks, Look
 from gsstream.engine.assembly.fault import Where, fault
 from gsstream.engine.assembly.output_checks import OUTPUT_CHECKS
+from gsstream.parts.backend.change import Change
 from gsstream.parts.backend.row_optimiser import RowOptimiser
 from gsstream.parts.render.session import RenderSession
 from gsstream.parts.residual.optimiser import ResidualOptimiser
 
 T = TypeVar("T")
-#: The names under which the table below and that of the checks list what parts open: sessions of a renderer, residuals
-#: of an optimiser. Errors about them name the part.
+#: The names under which the table below and that of the checks list what parts open: sessions and changes of a
+#: renderer, residuals of an optimiser. Errors about them name the part.
 SESSION, RESIDUAL = "session", "residual"
+OPENED: Mapping[str, type] = {SESSION: RenderSession, RESIDUAL: ResidualOptimiser, "change": Change}
 #: What a renderer brings: attributes that stand behind a guard of their own, so that an error names them.
 MEMBERS = ("loss", "optimiser")
 #: Default bodies that call other functions of their object, by kind and name. With the level "step", and where the
@@ -77,10 +79,11 @@ class Guarded:
 
     @classmethod
     def opened(cls, result: object, slot: str, part: object, where: Where, level: Checks) -> object:
-        """Return a session that a part opened behind a guard that names the part; return any other result as it is."""
-        if not isinstance(result, (RenderSession, ResidualOptimiser)):
+        """Return what a part opened behind a guard that names the part; return any other result as it is."""
+        kind = next((name for name, opened in OPENED.items() if isinstance(result, opened)), None)
+        if kind is None:
             return result
-        made = cls(slot, part, where, level, SESSION if isinstance(result, RenderSession) else RESIDUAL)
+        made = cls(slot, part, where, level, kind)
         made._subject = result
         return made
 

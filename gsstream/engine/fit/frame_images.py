@@ -6,11 +6,11 @@ from typing import Any
 
 import torch
 
-from gsstream.core.storage import packed, unpacked
+from gsstream.parts.render.images import float_image
 
 
 class FrameImages:
-    """The images of one frame as float32 tensors [H, W, 3] on a device, copied (as bytes) when first asked for."""
+    """The images [H, W, 3] of one frame on a device, copied as they are stored when first asked for."""
 
     def __init__(self, images: Any, device: torch.device) -> None:
         self._images, self.device = images, device
@@ -20,15 +20,14 @@ class FrameImages:
         return len(self._images)
 
     def stored(self, view: int) -> torch.Tensor:
-        """Return [H, W, 3] as it is stored, float32 or uint8, where it is worked on by the processor; else float32."""
-        return torch.from_numpy(self._images[view]) if self.device.type == "cpu" else self[view]
+        """Return [H, W, 3] as it is stored: float32, or uint8 of which 255 is 1.0."""
+        if view not in self._there:
+            self._there[view] = torch.from_numpy(self._images[view]).to(self.device)
+        return self._there[view]
 
     def __getitem__(self, view: int) -> torch.Tensor:
-        if self.device.type == "cpu":
-            return torch.from_numpy(unpacked(self._images[view]))
-        if view not in self._there:
-            stored = torch.from_numpy(packed(self._images[view])).to(self.device)
-            # Divided by a tensor, as the processor divides: a product with 1 / 255 would be another number.
-            full = stored.new_full((), 255, dtype=torch.float32)
-            self._there[view] = stored if stored.is_floating_point() else stored.float() / full
-        return self._there[view]
+        return float_image(self.stored(view))
+
+    def all_stored(self) -> list[torch.Tensor]:
+        """Return the images of all views as they are stored."""
+        return [self.stored(view) for view in range(len(self))]

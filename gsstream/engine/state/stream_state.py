@@ -83,6 +83,10 @@ class StreamState:
     #: it, either.
     resident: Resident | None = field(default=None, compare=False, repr=False)
 
+    def shown(self, device: torch.device) -> FrameImages:
+        """Return the images that the scene shows, on a device."""
+        return FrameImages(self.previous.images, device) if self.resident is None else self.resident.images
+
     @property
     def gaussians(self) -> Gaussians[torch.Tensor]:
         """The decoded scene as torch tensors that share the player's memory."""

@@ -19,14 +19,16 @@ from gsstream.engine.fit.constants import DSSIM
 from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.engine.fit.photometric import PhotometricLoss, render_exposed
 from gsstream.engine.state.stream_state import Resident, StreamState
-from gsstream.engine.step.active.candidates import VoteCache, changed_rows
-from gsstream.engine.step.active.change import MAX_PIXEL_SIGMA, Change
 from gsstream.input.seeds.shell import in_shell
 from gsstream.metrics.noise import noise_sigma
+from gsstream.parts.backend.change import Change
 from gsstream.parts.backend.row_optimiser import RowOptimiser
 from gsstream.parts.render.session import RenderSession
 from gsstream.parts.render.target import ViewTarget
 from gsstream.parts.render.wrt import G, LossAndGrad, Wrt
+
+#: Upper bound on the noise of one pixel of one image.
+MAX_PIXEL_SIGMA = 16 / 255
 
 
 class EngineContext:
@@ -49,10 +51,10 @@ class EngineContext:
         self._assembly, device, resident = assembly, assembly.renderer.device, state.resident
         if resident is None:
             gaussians = state.gaussians.map(lambda value: value.to(device))
-            resident = Resident(gaussians, state.hierarchy.to(device), FrameImages(state.previous.images, device))
+            resident = Resident(gaussians, state.hierarchy.to(device), state.shown(device))
         self._gaussians, self._hierarchy, self.previous_images = resident
         self._frame, self._previous, self._device = frame, state.previous, device
-        self._change = None if change is None else change.to(device)
+        self._change = change
         self._static = [] if change is None else (~change.tiles.flatten(1).any(1)).tolist()
         self._background, self._part_scale = assembly.background, part_scale
         self.log, self.key_rows = log, state.player.key_rows
@@ -60,7 +62,6 @@ class EngineContext:
         self.images = FrameImages(frame.images, device) if images is None else images
         self.photometric = PhotometricLoss(assembly.renderer.loss, DSSIM, self.images, exposure)
         self._session = state.session
-        self._votes = None if change is None else VoteCache(change, frame.cameras)
 
     @property
     def session(self) -> RenderSession:
@@ -137,8 +138,7 @@ class EngineContext:
         return upstream.contiguous()
 
     def noise_sigma(self, view: int) -> float:
-        # Where everything moves, the estimate measures the motion instead of the noise, so it is bounded; see
-        # MOST_SIGMA.
+        # Where everything moves, the estimate measures the motion instead of the noise, so it is bounded.
         measured = noise_sigma(self._previous.image(view), self._frame.image(view))
         return min(measured, MAX_PIXEL_SIGMA)
 
@@ -157,15 +157,9 @@ class EngineContext:
         return torch.from_numpy(in_shell(means, scales, self.cameras)).to(self._device)
 
     def changed_rows(self, min_votes: float) -> torch.Tensor:
-        rows = changed_rows(
-            self._change,
-            self._gaussians.means,
-            self.cameras,
-            session=self.session,
-            min_votes=min_votes,
-            book=self._votes,
-        )
-        return rows & ~self.shell_rows
+        if self._change is None:
+            return ~self.shell_rows
+        return self._change.rows(self._gaussians.means, self.cameras, self.session, min_votes) & ~self.shell_rows
 
     def narrow(self, rows: torch.Tensor) -> None:
         self._session = self.session_for(rows)

@@ -23,8 +23,7 @@ from gsstream.engine.assembly.guard import error_context
 from gsstream.engine.budget.epoch_scheduler import EpochScheduler
 from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.engine.state.stream_state import Resident, Step, StreamState, next_state, updated
-from gsstream.engine.step.active.candidates import CHANGE_VOTES, candidates
-from gsstream.engine.step.active.change_on_device import find_change
+from gsstream.engine.step.candidates import CHANGE_VOTES, candidates
 from gsstream.engine.step.context import EngineContext
 from gsstream.engine.step.metrics import step_numbers
 from gsstream.engine.step.motion import propose_motion
@@ -33,6 +32,8 @@ from gsstream.engine.step.problem import Problem
 from gsstream.engine.step.quantise import encode_frame, quantise_residual
 from gsstream.method.tools import Tools
 from gsstream.packet import PlayerState, decode_packet, encode_empty
+from gsstream.parts.backend.base import Renderer
+from gsstream.parts.backend.change import Change
 from gsstream.parts.growth.none import NoGrowth
 from gsstream.parts.render.session import RenderSession
 from gsstream.parts.update.base import Scope
@@ -48,7 +49,7 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
         return empty_step(state, frame, log)
     with log.phase("change"):
         images = FrameImages(frame.images, assembly.renderer.device)
-        change = find_change(state, frame, images, budget.change_threshold)
+        change = find_change(assembly.renderer, state, images, threshold=budget.change_threshold)
     if change is not None and change.share == 0 and scope is not Scope.ALL:
         return empty_step(state, frame, log)
     late = assembly.checks is not Checks.STEP
@@ -91,6 +92,13 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
     if (schedule.timed or schedule.sized) and (len(rows) or scope is Scope.NONE):
         log.set(budget=schedule.usage(fitted, state.player.layout))
     return Step(after, replace(fitted.packet, decoded=player), "empty" if unchanged else "delta")
+
+
+def find_change(renderer: Renderer, state: StreamState, images: FrameImages, threshold: float) -> Change | None:
+    """Return what changed since the frame that the scene shows; None where the threshold is 0: then everything did."""
+    if threshold == 0:
+        return None
+    return renderer.find_change(state.shown(images.device).all_stored(), images.all_stored(), threshold)
 
 
 def empty_step(state: StreamState, frame: Frame, log: FrameLog) -> Step:

@@ -14,11 +14,11 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.guard import error_context
 from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.engine.state.stream_state import StreamState, updated
-from gsstream.engine.step.active.change import Change
 from gsstream.engine.step.context import EngineContext
 from gsstream.method.tools import Tools
 from gsstream.packet.changes.field import encode_field
 from gsstream.packet.changes.motion import encode_motions
+from gsstream.parts.backend.change import Change
 from gsstream.parts.update.base import Scope
 
 #: Largest share of the bytes a frame may take that its motions may take, where a residual follows them.

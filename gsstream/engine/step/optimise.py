@@ -32,7 +32,7 @@ from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.budget.epoch_scheduler import EpochScheduler, estimated_bytes
 from gsstream.engine.fit.constants import GATE_LR
 from gsstream.engine.fit.gates import TrainedGates
-from gsstream.engine.step.active.candidates import keep_mask
+from gsstream.engine.step.candidates import keep_mask
 from gsstream.engine.step.problem import Problem, Solution
 from gsstream.parts.gate.base import GateSampler
 from gsstream.parts.residual.layout import joint_layout

@@ -1,8 +1,8 @@
 """Renderer: Gaussians and one camera in, an image and gradients out; and what else is computed where it works.
 
-A renderer brings the loss and the row optimiser that work beside it. They are no parts of their own, because all
-implementations give the same numbers and only those that know each other are fast together. The defaults are the
-reference ones, in torch on any device: a renderer that draws and nothing else is complete.
+A renderer brings the loss and the row optimiser that work beside it, and finds what changed in images. They are no
+parts of their own, because all implementations give the same numbers and only those that know each other are fast
+together. The defaults are the reference ones, in torch on any device: a renderer that only draws is complete.
 
 Conventions: pixel-corner origin, 0.3 px screen-space blur, alpha cut at 1/255, alpha clamped at 0.999, a Gaussian
 counts while the transmittance before it exceeds 1e-4, near plane ``cameras.near_plane``. Tiles are 16 x 16 pixels.
@@ -11,6 +11,7 @@ counts while the transmittance before it exceeds 1e-4, near plane ``cameras.near
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 
 import torch
 
@@ -19,6 +20,7 @@ from gsstream.core.context import ScreenGradient
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.part import Part
 from gsstream.parts.backend.adam import ReferenceAdam
+from gsstream.parts.backend.change import Change, find_change
 from gsstream.parts.backend.row_optimiser import RowOptimiser
 from gsstream.parts.render.drawn import drawn_rows
 from gsstream.parts.render.loss import Loss, ReferenceLoss
@@ -42,6 +44,15 @@ class Renderer(Part):
     def optimiser(self) -> RowOptimiser:
         """What moves rows: its residual optimisers are given sessions of this renderer and no others."""
         return ReferenceAdam()
+
+    def find_change(self, before: Sequence[torch.Tensor], now: Sequence[torch.Tensor], threshold: float) -> Change:
+        """Say which tiles of which views changed. Another body finds the same tiles, bit for bit.
+
+        Arguments:
+            before, now: one image [H, W, 3] per view where the renderer works, float32, or uint8 of which 255 is 1.0.
+            threshold: multiple of the noise of the means of 4 x 4 pixels, above 0.
+        """
+        return find_change(before, now, threshold)
 
     @abstractmethod
     def render(

@@ -10,7 +10,7 @@ import torch
 from gsstream_hicom.motion import CoherentMotion, cell_sides
 
 from gsstream.api import Rng, Scene, apply_motion
-from gsstream.blocks import high_gradient_rows
+from gsstream.parts.growth.copying import high_gradient_rows
 from tests.scenes import RIG, SquaredDistances, scene_at
 
 RNG = np.random.default_rng(0)

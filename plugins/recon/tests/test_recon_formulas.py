@@ -9,8 +9,9 @@ import pytest
 from gsstream_recon.anchors import AnchorLevels, Level, bound, inherited
 from gsstream_recon.motion import AnchorMotion
 
-from gsstream.api import Delta, Displacement, Layout, Rng, Scene, apply_motion
+from gsstream.api import Delta, Layout, Rng, Scene, apply_motion
 from gsstream.blocks import pixel_size
+from gsstream.core.changes import Displacement
 from gsstream.testing import MethodUnderTest
 from tests.scenes import RIG, SquaredDistances, scene_at
 

@@ -10,6 +10,7 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.context import ScreenGradient
 from gsstream.parts.backend.base import ScatterSession
+from gsstream.parts.backend.change import Change, find_change
 from gsstream.parts.backend.reference import ReferenceRenderer
 from gsstream.parts.render.session import RenderOutput, RenderSession
 from gsstream.parts.render.target import ViewTarget
@@ -218,3 +219,25 @@ class Repairing(Opens):
     """Takes 0 for a value that is not a number, and says nothing."""
 
     opened = _Repairs
+
+
+@spoils("check_renderer_change")
+class Lenient(Adapter):
+    """Finds a change only where it is a tenth larger than the threshold says."""
+
+    def find_change(self, before: Any, now: Any, threshold: float) -> Change:
+        return find_change(before, now, 1.1 * threshold)
+
+
+class _Late(Change):
+    def rows(self, means: torch.Tensor, cameras: Cameras, session: RenderSession, min_votes: float) -> torch.Tensor:
+        return super().rows(means, cameras, session, min_votes) & (means[:, 0] > 0)
+
+
+@spoils("check_renderer_changed_rows")
+class Onesided(Adapter):
+    """Takes only rows on one side of the scene for changed."""
+
+    def find_change(self, before: Any, now: Any, threshold: float) -> Change:
+        found = find_change(before, now, threshold)
+        return _Late(found.tiles, found.height, found.width)

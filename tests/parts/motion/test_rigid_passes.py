@@ -13,12 +13,12 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.picture_size import enlargement
 from gsstream.core.rng import Rng
-from gsstream.engine.step.active.change import Change, detect_changed_tiles
 from gsstream.engine.step.motion import Moved, propose_motion
 from gsstream.engine.step.tools import RunTools
 from gsstream.input.recordings.open import open_source
 from gsstream.method.budget import FrameBudget
 from gsstream.packet.changes.motion import encode_motions
+from gsstream.parts.backend.change import Change, find_change
 from gsstream.parts.motion.groups import pixel_size
 from gsstream.parts.motion.rigid import Rigid
 from gsstream.parts.render.wrt import WrtRows
@@ -125,7 +125,7 @@ def within(max_bytes: int | None) -> Moved:
     state = method_with("motion", MOVES).chain()[1].state
     frame = replace(open_source(SOURCE).frame(2), cameras=state.previous.cameras)
     budget = FrameBudget(epochs=1, change_threshold=6.0, rd_lambda=0.0, max_bytes=max_bytes)
-    change = detect_changed_tiles(state.previous, frame, 6.0)
+    change = find_change(*(list(map(torch.from_numpy, each.images)) for each in (state.previous, frame)), 6.0)
     tools = RunTools(parts, Rng(0), Mock(), Mock(), budget=budget)
     return propose_motion(parts, state, frame, change, tools)
 

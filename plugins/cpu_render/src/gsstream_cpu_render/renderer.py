@@ -6,15 +6,17 @@ residual optimiser every session for a :class:`CpuSession`, because the engine g
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import final
 
 import torch
 from pydantic import Field
 
 from gsstream.api import Cameras, Gaussians, PartConfig
-from gsstream.backend import Loss, Renderer, RenderOutput, RenderSession, RowOptimiser
+from gsstream.backend import Change, Loss, Renderer, RenderOutput, RenderSession, RowOptimiser
 from gsstream_cpu_render.adam_part import CpuAdam
 from gsstream_cpu_render.autograd import differentiable
+from gsstream_cpu_render.change import find_change
 from gsstream_cpu_render.loss_part import CpuLoss
 from gsstream_cpu_render.pool import acquire_rasterizer
 from gsstream_cpu_render.session import CpuSession, FullPass
@@ -56,6 +58,9 @@ class CpuRenderer(Renderer):
     @property
     def optimiser(self) -> RowOptimiser:
         return CpuAdam()
+
+    def find_change(self, before: Sequence[torch.Tensor], now: Sequence[torch.Tensor], threshold: float) -> Change:
+        return find_change(before, now, threshold)
 
     def render(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, background: Background

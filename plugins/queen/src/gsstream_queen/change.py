@@ -77,8 +77,8 @@ def changed_tiles(work: FrameTools, dynamic: torch.Tensor, renderer: Renderer) -
     for view in range(len(cameras)):
         with torch.no_grad():
             alpha = renderer.render(alone, cameras, view, (0.0, 0.0, 0.0)).alpha
-        count, size = count_per_tile((alpha > ALPHA).numpy())
-        changed = torch.from_numpy(count >= size * PIXELS / TILE**2).float()[None, None]
+        count, size = count_per_tile(alpha > ALPHA)
+        changed = (count >= size * PIXELS / TILE**2).float()[None, None]
         kernel = 2 * DILATE + 1
         masks.append(torch.nn.functional.max_pool2d(changed, kernel, 1, DILATE)[0, 0] > 0)
     return masks

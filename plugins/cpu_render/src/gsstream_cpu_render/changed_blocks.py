@@ -1,36 +1,20 @@
-"""Means over small blocks of pixels, in which noise averages out and a change does not; and what their noise is."""
+"""Means over small blocks of pixels and what their noise is, in numpy: the blocks that ``gsstream.backend`` finds."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gsstream.core.median import median
-from gsstream.core.shapes import BoolArray, FloatArray
-from gsstream.core.storage import unpacked
-from gsstream.metrics.noise import MAD_TO_SIGMA, median_deviation
+from gsstream.api import FloatArray
+from gsstream.backend import ChangeRule, median
 
-#: Differences are averaged over BLOCK x BLOCK pixels first: noise of neighbouring pixels is mostly independent and
-#: averages out (rendered noise is heavy-tailed, so a threshold on single pixels finds it everywhere), motion does not.
-BLOCK = 4
-#: Rows that are subtracted at a time, a multiple of BLOCK.
+#: Rows that are subtracted at a time, a multiple of the side of a block.
 _BAND = 64
-#: Lower bound on the estimated noise of a block's mean difference. Compressed video repeats still blocks exactly;
-#: without a floor the change of half a grey level by the encoder would count as motion.
-LEAST_SIGMA = 0.5 / 255
-#: Upper bound on the same estimate. The estimate holds while fewer than half of the blocks
-#: move; a flash or a cut moves all of them, and then the change itself would pass for noise and nothing would be seen
-#: to change. Recordings have about 1 / 255.
-MOST_SIGMA = 4 / 255
-#: Upper bound on the same estimate, in multiples of the differences between neighbouring blocks. Noise differs from
-#: block to block, a slow change of the light hardly does: at a gain of 1.03 the spread of the differences doubles,
-#: their second differences grow by 5 %. Without such a change the first is at most 1.2 times the second on the
-#: recordings at hand.
-MOST_OF_ROUGHNESS = 1.5
 
 
-def changed_blocks(before: Any, now: Any, threshold: float) -> BoolArray:
+def changed_blocks(before: Any, now: Any, threshold: float) -> NDArray[np.bool_]:
     """Return [ceil(H / 4), ceil(W / 4)] bool: blocks whose mean difference exceeds the noise of block means.
 
     Arguments:
@@ -52,19 +36,31 @@ def _difference(before: Any, now: Any) -> Any:
     """[H, W, 3] float32, or int16 in levels of 8 bits where both images are stored as bytes."""
     if before.dtype == now.dtype == np.uint8:
         return np.subtract(now, before, dtype=np.int16)
-    return unpacked(now) - unpacked(before)
+    return floats(now) - floats(before)
+
+
+def floats(image: Any) -> FloatArray:
+    """Return a stored image as float32, of which 255 of a byte is 1.0."""
+    if image.dtype == np.uint8:
+        return np.asarray(np.divide(image, np.float32(255), dtype=np.float32))
+    return np.asarray(image, np.float32)
+
+
+def _median_deviation(values: FloatArray) -> Any:
+    difference = values - median(values)
+    return median(np.abs(difference, out=difference))
 
 
 def block_sigma(means: FloatArray) -> float:
     """Return the noise of block means of a difference, image units, within its bounds."""
     # Where most are this small no median has to be found: their deviation from it is at most twice as large.
-    small = LEAST_SIGMA / (2 * MAD_TO_SIGMA) * (1 - 1e-9)
+    small = ChangeRule.LEAST_SIGMA / (2 * ChangeRule.MAD_TO_SIGMA) * (1 - 1e-9)
     if 2 * np.count_nonzero(np.abs(means) < small) > means.size:
-        return LEAST_SIGMA
-    spread = MAD_TO_SIGMA * float(median_deviation(means))
-    if spread <= LEAST_SIGMA:  # then it does not matter what second differences admit
-        return LEAST_SIGMA
-    return min(max(_at_most_rough(spread, means), LEAST_SIGMA), MOST_SIGMA)
+        return ChangeRule.LEAST_SIGMA
+    spread = ChangeRule.MAD_TO_SIGMA * float(_median_deviation(means))
+    if spread <= ChangeRule.LEAST_SIGMA:  # then it does not matter what second differences admit
+        return ChangeRule.LEAST_SIGMA
+    return min(max(_at_most_rough(spread, means), ChangeRule.LEAST_SIGMA), ChangeRule.MOST_SIGMA)
 
 
 def block_means(picture: Any) -> FloatArray:
@@ -75,16 +71,16 @@ def block_means(picture: Any) -> FloatArray:
     sums = _sums(_sums(picture).swapaxes(0, 1)).swapaxes(0, 1)
     if sums.dtype == np.int16:
         sums = np.divide(sums, 255.0)
-    if not any(n % BLOCK for n in picture.shape[:2]):
-        return np.asarray(np.multiply(sums, 1 / BLOCK**2, dtype=np.float64))
-    sizes = [np.minimum(BLOCK, n - np.arange(0, n, BLOCK)) for n in picture.shape[:2]]
+    if not any(n % ChangeRule.BLOCK for n in picture.shape[:2]):
+        return np.asarray(np.multiply(sums, 1 / ChangeRule.BLOCK**2, dtype=np.float64))
+    sizes = [np.minimum(ChangeRule.BLOCK, n - np.arange(0, n, ChangeRule.BLOCK)) for n in picture.shape[:2]]
     return np.asarray(sums / np.outer(*sizes)[..., None])
 
 
 def _sums(rows: Any) -> Any:
-    """Sums over BLOCK rows each; the last block may have fewer. A fifth of the time of ``np.add.reduceat``."""
-    whole = len(rows) // BLOCK * BLOCK
-    first, second, third, fourth = (rows[i:whole:BLOCK] for i in range(BLOCK))
+    """Sums over the rows of a block each; the last block may have fewer. A fifth of the time of ``np.add.reduceat``."""
+    whole = len(rows) // ChangeRule.BLOCK * ChangeRule.BLOCK
+    first, second, third, fourth = (rows[i : whole : ChangeRule.BLOCK] for i in range(ChangeRule.BLOCK))
     # The order in which reduceat adds, so that streams keep their bits.
     sums = first + (second + third + fourth)
     if whole == len(rows):
@@ -105,11 +101,11 @@ def _at_most_rough(spread: float, means: FloatArray) -> float:
         out = values[along:].reshape(rows, columns - 2, channels)
         _second_differences(means[:, :-2], means[:, 1:-1], means[:, 2:], out)
     # The variance of a - 2 b + c is six times that of each.
-    admitted = MOST_OF_ROUGHNESS * MAD_TO_SIGMA / np.sqrt(6)
+    admitted = ChangeRule.MOST_OF_ROUGHNESS * ChangeRule.MAD_TO_SIGMA / np.sqrt(6)
     # Usually it admits more than the spread, and to see that takes counting alone; the margin is for rounding.
     if np.count_nonzero(values < spread / admitted * (1 + 1e-9)) < len(values) // 2:
         return spread
-    return min(spread, float(MOST_OF_ROUGHNESS * MAD_TO_SIGMA * median(values) / np.sqrt(6)))
+    return min(spread, float(ChangeRule.MOST_OF_ROUGHNESS * ChangeRule.MAD_TO_SIGMA * median(values) / np.sqrt(6)))
 
 
 def _second_differences(first: FloatArray, second: FloatArray, third: FloatArray, out: FloatArray) -> None:

@@ -1,1 +1,0 @@
-"""Which Gaussians take part in a frame."""

@@ -1,0 +1,129 @@
+"""What changed between two frames, in numpy: the tiles, rows and differences that ``gsstream.backend`` finds in torch.
+
+Nine tenths of a picture stand still, and most rows are drawn where nothing changed: only the rest is looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsstream.api import Cameras, FloatArray, IntArray
+from gsstream.backend import Change, RenderSession, changed_tiles
+from gsstream_cpu_render.changed_blocks import changed_blocks, floats
+from gsstream_cpu_render.loss import TILE
+from gsstream_cpu_render.threads import num_threads
+
+BoolArray = NDArray[np.bool_]
+#: Number of pixels from which several views are compared at a time: with fewer, threads take longer than they save.
+THREADED_PIXELS = 1 << 19
+
+
+def find_change(before: Sequence[torch.Tensor], now: Sequence[torch.Tensor], threshold: float) -> CpuChange:
+    """Return the changed tiles of every view; see ``gsstream.backend.Renderer.find_change``."""
+
+    def of(pair: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
+        return changed_tiles(torch.from_numpy(changed_blocks(pair[0].numpy(), pair[1].numpy(), threshold)))
+
+    height, width = now[0].shape[:2]
+    pairs = zip(before, now, strict=True)
+    if height * width >= THREADED_PIXELS:
+        with ThreadPoolExecutor(num_threads()) as pool:
+            tiles = list(pool.map(of, pairs))
+    else:
+        tiles = [of(pair) for pair in pairs]
+    return CpuChange(torch.stack(tiles), height, width)
+
+
+class _VoteCache:
+    """The votes of a frame that were counted so far: a centre that has not moved since keeps its own."""
+
+    def __init__(self) -> None:
+        self._means, self._votes = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+
+    def of(
+        self, means: torch.Tensor, rows: torch.Tensor, count: Callable[[torch.Tensor], torch.Tensor]
+    ) -> torch.Tensor:
+        """Return the votes [A] of these rows [A] of a scene with centres [N, 3]; ``count`` counts those not known."""
+        centres, asked = means.numpy(), rows.numpy()
+        if len(centres) != len(self._means):
+            self._means = np.full_like(centres, np.nan)  # equal to no centre
+            self._votes = np.zeros(len(centres), np.float32)
+        now, before = centres[asked], self._means[asked]
+        known = (now[:, 0] == before[:, 0]) & (now[:, 1] == before[:, 1]) & (now[:, 2] == before[:, 2])
+        fresh = asked[~known]
+        if len(fresh):
+            self._means[fresh] = centres[fresh]
+            self._votes[fresh] = count(torch.from_numpy(centres[fresh])).numpy()
+        return torch.from_numpy(self._votes[asked])
+
+
+@dataclass(frozen=True)
+class CpuChange(Change):
+    """Changed tiles, and the votes of a frame that were counted so far."""
+
+    _known: _VoteCache = field(default_factory=_VoteCache, compare=False, repr=False)
+
+    def only_changed(self, view: int, values: torch.Tensor) -> torch.Tensor:
+        return self._in_changed(view, lambda region: values.numpy()[region])
+
+    def difference(self, view: int, now: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
+        return self._in_changed(view, lambda region: floats(now.numpy()[region]) - floats(before.numpy()[region]))
+
+    def _in_changed(self, view: int, of: Callable[[tuple[slice, slice]], FloatArray]) -> torch.Tensor:
+        """[H, W, 3] what ``of`` says of the changed regions of a view.
+
+        Nine tenths of a picture stand still: where nothing is written, the memory is not even touched.
+        """
+        out = np.zeros((self.height, self.width, 3), np.float32)
+        for region in _regions(self.tiles[view].numpy()):
+            out[region] = of(region)
+        return torch.from_numpy(out)
+
+    def votes(self, means: torch.Tensor, cameras: Cameras) -> torch.Tensor:
+        dilated = self.dilated.flatten(1).numpy()
+        # What lies in no picture looks up a tile that never changes.
+        lookup = np.concatenate([dilated, np.zeros((len(dilated), 1), np.bool_)], 1)
+        hits, seen = np.zeros(len(means), np.int32), np.zeros(len(means), np.int32)
+        centres = np.ascontiguousarray(means.numpy().T)
+        for view in range(len(cameras)):
+            inside, tile = self._tile_of(centres, cameras, view)
+            seen += inside
+            hits += lookup[view].take(np.where(inside, tile, len(lookup[view]) - 1))
+        return torch.from_numpy(np.divide(hits, np.maximum(seen, 1), dtype=np.float32))
+
+    def _tile_of(self, centres: FloatArray, cameras: Cameras, view: int) -> tuple[BoolArray, IntArray]:
+        """[N] bool, which of the centres [3, N] project into a picture; [N] index of the tile, of any value elsewhere.
+
+        Column by column: a row's answer has the same bits whatever other rows are asked about.
+        """
+        pose, K = cameras.viewmats[view].astype(np.float32), cameras.Ks[view].astype(np.float32)
+        x, y, z = (row[0] * centres[0] + row[1] * centres[1] + row[2] * centres[2] + row[3] for row in pose[:3])
+        inside: BoolArray = z > cameras.near_plane
+        inverse = np.float32(1) / np.where(inside, z, np.float32(1))
+        u, v = K[0, 0] * x * inverse + K[0, 2], K[1, 1] * y * inverse + K[1, 2]
+        inside &= (u >= 0) & (v >= 0) & (u < self.width) & (v < self.height)
+        # Numbers beyond the picture may not fit into an integer.
+        u, v = (np.where(inside, of, np.float32(0)) * np.float32(1 / TILE) for of in (u, v))
+        return inside, v.astype(np.int32) * np.int32(-(-self.width // TILE)) + u.astype(np.int32)
+
+    def rows(self, means: torch.Tensor, cameras: Cameras, session: RenderSession, min_votes: float) -> torch.Tensor:
+        if self.share == 0:
+            return torch.zeros(len(means), dtype=torch.bool)
+        seen = session.visible_anywhere(self.tiles)
+        rows = seen.nonzero()[:, 0]
+        seen[rows] = self._known.of(means, rows, lambda some: self.votes(some, cameras)) >= min_votes
+        return seen
+
+
+def _regions(tiles: BoolArray) -> Iterator[tuple[slice, slice]]:
+    """Rows and columns of pixels of each run of marked tiles [rows, columns] bool that lie side by side."""
+    padded = np.pad(tiles, ((0, 0), (1, 1)))
+    rows, edges = np.nonzero(padded[:, 1:] != padded[:, :-1])  # a run begins and ends at an edge
+    for row, first, last in zip(rows[::2].tolist(), edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        yield slice(row * TILE, (row + 1) * TILE), slice(first * TILE, last * TILE)

@@ -55,7 +55,7 @@ class EngineContext:
         self._gaussians, self._hierarchy, self.previous_images = resident
         self._frame, self._previous, self._device = frame, state.previous, device
         self._change = change
-        self._static = [] if change is None else (~change.tiles.flatten(1).any(1)).tolist()
+        self._static = [] if change is None else [count == 0 for count in change.per_view]
         self._background, self._part_scale = assembly.background, part_scale
         self.log, self.key_rows = log, state.player.key_rows
         exposure = None if state.exposure is None else state.exposure.to(device)

@@ -62,10 +62,15 @@ class Change:
     height: int
     width: int
 
-    @cached_property
+    @cached_property  # it is the one number that a GPU is waited for
+    def per_view(self) -> list[int]:
+        """Number of changed tiles of each view."""
+        return list(self.tiles.flatten(1).sum(1).cpu().tolist())
+
+    @property
     def share(self) -> float:
         """Share of changed tiles over all views."""
-        return float(self.tiles.float().mean()) if self.tiles.numel() else 0.0
+        return sum(self.per_view) / max(self.tiles.numel(), 1)
 
     @cached_property  # every iteration asks for it
     def dilated(self) -> torch.Tensor:

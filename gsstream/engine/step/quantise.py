@@ -18,8 +18,9 @@ from gsstream.engine.step.problem import Problem, Solution
 from gsstream.method.packets import delta_packet
 from gsstream.packet import EncodedPacket, PlayerState, quantise_decoders
 from gsstream.packet.changes.motion import encode_motions
-from gsstream.parts.update.base import AttributeCode, scale_steps
+from gsstream.parts.residual.layout import AttributeCode
 from gsstream.parts.update.base import quantise_latents as residual_symbols
+from gsstream.parts.update.base import scale_steps
 
 #: Largest symbol of 32 bits that float32 represents: anything between it and 2^31 would be rounded up to 2^31.
 MAX_INT32_SYMBOL = 2.0**31 - 256

@@ -190,12 +190,12 @@ def test_without_a_device_there_is_no_button_and_without_https_a_sentence(site, 
             ["go", f"{url}/index.html?xr=vr"], ["until", f"{PLAYER}?.drew"], ["pause", 300], ["evaluate", hidden],
             ["go", f"{url.replace('127.0.0.1', 'other.test')}/index.html?xr=vr"], ["until", f"{PLAYER}?.drew"],
             ["until", f"!{hidden}"], ["evaluate", f"{ROOT}.querySelector('.headset').click()"],
-            ["evaluate", MESSAGE], ["go", f"{url.replace('127.0.0.1', 'other.test')}/index.html"],
+            ["until", MESSAGE], ["evaluate", MESSAGE], ["go", f"{url.replace('127.0.0.1', 'other.test')}/index.html"],
             ["until", f"{PLAYER}?.drew"], ["pause", 300], ["evaluate", hidden],
         ]  # fmt: skip
         results = in_browser(steps, tmp_path, flags=["--host-resolver-rules=MAP other.test 127.0.0.1"])
     assert results[3] is True
-    assert "https" in results[8]
+    assert "https" in results[9]
     assert results[-1] is True
 
 

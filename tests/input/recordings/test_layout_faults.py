@@ -117,7 +117,7 @@ FAULTS: dict[str, tuple[str, Callable[[Path], Any], str]] = {
     "mirror": ("nerfstudio", edit_json("transforms.json", mirrored), "'cam1': the 3x3 part is not a rotation"),
     "moving": ("nerfstudio timed", edit_json("transforms.json", moving), "a camera that moves"),
     "model": ("nerfstudio", edit_json("transforms.json", lambda d: d.update(camera_model="EQUIRECTANGULAR")),
-              "camera_model 'EQUIRECTANGULAR'; expected one of"),
+              "'EQUIRECTANGULAR' of camera '.*' is not supported; expected"),
     "focal text": ("nerfstudio", edit_json("transforms.json", frame(2, fl_x="wide")), "fl_x of camera 'cam2' must be"),
     "outside": ("nerfstudio", edit_json("transforms.json", frame(0, file_path="/etc/x.png")), "must stay inside"),
     "folds": ("nerfstudio", edit_json("transforms.json", lambda d: d.update(k1=-40.0)), "leaves no usable picture"),

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from scenes import World, make_world, write_nerfstudio
 
 from gsstream.core.errors import SourceError
@@ -119,6 +120,7 @@ def still_scene(folder: Path, world: World) -> Path:
     def first_only(data: dict[str, Any]) -> None:
         first = [entry for entry in data["frames"] if entry.pop("time") == 0]
         data["frames"] = first
+        data["test_filenames"] = [entry["file_path"] for entry in first if "cam0" in entry["file_path"]]
 
     edit(folder, first_only)
     return folder
@@ -154,7 +156,12 @@ def test_a_hole_in_a_recording_never_shifts_a_camera(timed, tmp_path, world) -> 
 
 
 def test_cameras_of_two_sizes_name_the_command_that_mends_it(tmp_path, world) -> None:
+    """One camera has pictures of half the size; the intrinsics of the file still fit its view."""
     folder = write_nerfstudio(tmp_path / "n", world)
-    edit(folder, lambda d: d["frames"][1].update(w=d["w"] // 2))
-    with pytest.raises(SourceError, match=r"one image size.*gsstream scene prepare"):
+    for path in (folder / "images" / "cam1").iterdir():
+        Image.open(path).reduce(2).save(path)
+    with (
+        pytest.raises(SourceError, match=r"one image size.*gsstream scene prepare"),
+        pytest.warns(RecordingWarning, match="1 of 4 cameras are calibrated for another size"),
+    ):
         open_source(str(folder))

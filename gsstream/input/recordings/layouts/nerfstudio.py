@@ -1,41 +1,73 @@
 """nerfstudio (and instant-ngp) transforms.json.
 
 ``frames``: a list of ``file_path`` and ``transform_matrix``, camera to world with OpenGL axes (x right, y up, z back).
-Intrinsics ``fl_x fl_y cx cy w h`` and distortion ``k1 k2 k3 k4 p1 p2`` once or per frame, or ``camera_angle_x`` alone;
-``camera_model`` OPENCV (default), PINHOLE, SIMPLE_PINHOLE, OPENCV_FISHEYE. Pixels have their origin at the image
-corner, world units are whatever wrote the file.
+Intrinsics ``fl_x fl_y cx cy w h`` and distortion once or per frame, or angles ``camera_angle_x``, ``camera_angle_y``
+(radians) and ``x_fov``, ``y_fov`` (degrees); ``camera_model`` says which coefficients there are, ``is_fisheye`` that
+they are a fisheye's. Pixels have their origin at the image corner, world units are whatever wrote the file.
 
 One camera per entry: its ``file_path`` is a video, a folder of frames, or one image (a still scene of one frame).
 Entries of one folder with equal poses are one camera's frames, in the order of ``time`` if given, else of their names;
-in one flat folder those of equal pose and intrinsics are. Entries without a picture are skipped, with a warning.
-``test_filenames`` (and ``val_filenames``) are test cameras; without them there is none. ``ply_file_path``: points, made
-from all images.
+in one flat folder those of equal pose and intrinsics are. Entries without a picture or a pose are skipped, with a
+warning. ``test_filenames`` (and ``val_filenames``) are test cameras; without them there is none. Where there are
+``train_filenames``, cameras of no list are left out. ``ply_file_path``: points, made from all images.
 """
 
 from __future__ import annotations
 
 import math
-import warnings
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
 
-from gsstream.core.cameras import Cameras
-from gsstream.core.errors import SourceError
+from gsstream.core.errors import SourceError, suggest
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.calibration import read_json
-from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip
-from gsstream.input.recordings.layouts.nerfstudio_groups import group_entries
+from gsstream.input.recordings.clips import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Clip, ImageClip, folder_clip
 from gsstream.input.recordings.lens import Lens
+from gsstream.input.recordings.foreign import Keys, check_keys, left_out, matrix, number, pixels, warn
+from gsstream.input.recordings.layouts.nerfstudio_groups import INTRINSICS, group_entries
 from gsstream.input.recordings.pointfiles import read_ply_points
 from gsstream.input.recordings.poses import from_opengl
 from gsstream.input.recordings.recorded import Recording, SeenPoints
-from gsstream.input.recordings.sync import RecordingWarning
+from gsstream.input.recordings.rigs.camera import RigCamera, assembled_rig
 
 FILE = "transforms.json"
 Missing = Literal["skip", "refuse"]
-_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
+_BROWN = ("p1", "p2")
+#: Model -> its kind, its radial coefficients, its tangential ones.
+_MODELS: dict[str, tuple[Literal["radial", "fisheye"], tuple[str, ...], tuple[str, ...]]] = {
+    "SIMPLE_PINHOLE": ("radial", (), ()),
+    "PINHOLE": ("radial", (), ()),
+    "SIMPLE_RADIAL": ("radial", ("k1",), ()),
+    "RADIAL": ("radial", ("k1", "k2"), ()),
+    "OPENCV": ("radial", ("k1", "k2", "k3"), _BROWN),
+    "FULL_OPENCV": ("radial", ("k1", "k2", "k3", "k4", "k5", "k6"), _BROWN),
+    "SIMPLE_FISHEYE": ("fisheye", (), ()),
+    "SIMPLE_RADIAL_FISHEYE": ("fisheye", ("k1",), ()),
+    "RADIAL_FISHEYE": ("fisheye", ("k1", "k2"), ()),
+    "OPENCV_FISHEYE": ("fisheye", ("k1", "k2", "k3", "k4"), ()),
+}
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_SPLITS = ("train_filenames", "val_filenames", "test_filenames")
+#: null counts as not given.
+_OPTIONAL = ("w", "h", "fps", "time", "camera_model", "is_fisheye", "transform_matrix", "ply_file_path", *_SPLITS)
+#: Of nerfstudio 1.1, instant-ngp 2 and exporters for Blender; what has no effect there belongs to training or to masks.
+_KEYS = Keys(
+    read=(*INTRINSICS, "fps", "time", "frames", "file_path", "transform_matrix", "ply_file_path", *_SPLITS),
+    idle=(
+        "applied_transform", "applied_scale", "orientation_override", "auto_scale_poses_override", "aabb_scale", "aabb",
+        "scale", "offset", "from_na", "sharpness", "up", "n_images", "enable_depth_loading", "integer_depth_scale",
+        "enable_ray_loading", "white_transparent", "black_transparent", "fix_premult", "light_dir", "render_aabb",
+        "colmap_im_id", "colmap_image_id", "depth_file_path", "depth_unit_scale_factor", "mask_path",
+        "normal_file_path", "semantics_file_path", "panoptic_classes", "rotation", "camera_id", "cam_id",
+    ),
+    refused=(
+        "rolling_shutter", "latlong", "ftheta_*", "k7", "k8", "p3", "p4", "b1", "b2", "s1", "s2", "s3", "s4", "sk_x",
+        "sx1", "sx2", "sy1", "sy2", "skew", "is_equirectangular", "distortion_params", "camera_convention",
+        "coordinate_system", "is_ortho", "ortho_scale", "shift_x", "shift_y",
+    ),
+)  # fmt: skip
 
 
 def looks_like(folder: Path) -> bool:
@@ -50,38 +82,25 @@ def read(folder: Path, missing: Missing = "skip") -> Recording:
     """
     path = folder / FILE
     data = _load(path)
-    there = _present(folder, path, data["frames"], missing)
+    files = _files(folder, data["frames"])
+    there = _present(path, data["frames"], files, missing)
     groups = group_entries(path, there, _pose)
     if len(there) < len(data["frames"]) and any(len(g) > 1 and "time" not in g[0] for g in groups.values()):
         raise SourceError(
             f"{path}: pictures of a recording are missing, and no 'time' says which instants are left: the cameras "
             "would be shifted against each other. Restore them, or give every entry its 'time'"
         )
-    poses, Ks, lenses, sizes = [], [], {}, {}
-    clips: dict[str, Clip] = {}
-    for name, entries in groups.items():
-        clips[name] = _clip(folder, entries)
-        merged = {**data, **entries[0]}
-        poses.append(from_opengl(_pose(path, entries[0])))
-        Ks.append(_intrinsics(path, merged, name, clips[name].size))
-        sizes[name] = (int(merged.get("w", clips[name].size[0])), int(merged.get("h", clips[name].size[1])))
-        lens = _lens(path, merged)
-        if lens is not None and not lens.is_identity:
-            lenses[name] = lens
-    names = tuple(groups)
-    held_out = {str(f) for key in ("test_filenames", "val_filenames") for f in data.get(key) or ()}
-    test = tuple(name for name, entries in groups.items() if any(e["file_path"] in held_out for e in entries))
-    return Recording(
-        name=folder.resolve().name,
-        where=str(path),
-        rig=Cameras(names, np.stack(poses), np.stack(Ks), *sizes[names[0]]),
-        clips=clips,
-        test=test,
-        fps=float(data.get("fps", 30.0)),
-        lenses=lenses,
-        sizes=sizes,
-        points=lambda _: _points(folder, data, len(names)),
-    )
+    groups, test = _split(path, data, groups)
+    clips = {name: _clip([files[entry["file_path"]] for entry in entries]) for name, entries in groups.items()}
+    cameras = {name: _camera(path, {**data, **entries[0]}, name, clips[name].size) for name, entries in groups.items()}
+    points = data.get("ply_file_path")
+    if points is not None and not (isinstance(points, str) and (folder / points).is_file()):
+        warn(f"{path}: ply_file_path {points!r} is no file of the folder; the recording has no points")
+        points = None
+    return assembled_rig(
+        folder, path, cameras, clips, test=test, points=lambda _: _points(folder, points, len(groups)),
+        fps=number(str(path), "fps", data.get("fps", 30.0), above=0, below=1e6),
+    )  # fmt: skip
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -89,42 +108,108 @@ def _load(path: Path) -> dict[str, Any]:
     frames = known.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         raise SourceError(f"{path}: 'frames' must be a non-empty list of objects")
-    for number, frame in enumerate(frames):
-        name = frame.get("file_path")
+    known, *frames = [
+        {key: value for key, value in entry.items() if value is not None or key not in _OPTIONAL}
+        for entry in (known, *frames)
+    ]
+    for place, entry in enumerate(frames):
+        name = entry.get("file_path")
         if not isinstance(name, str) or not name:
-            raise SourceError(f"{path}: frame {number} has no 'file_path'")
-        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+            raise SourceError(f"{path}: frame {place} has no 'file_path'")
+        entry["file_path"] = _plain(name)
+        if PurePosixPath(entry["file_path"]).is_absolute() or ".." in PurePosixPath(entry["file_path"]).parts:
             raise SourceError(f"{path}: file_path {name!r} must stay inside the folder")
-    if known.get("camera_model", "OPENCV") not in _MODELS:
-        raise SourceError(f"{path}: camera_model {known['camera_model']!r}; expected one of {', '.join(_MODELS)}")
-    return known
+        if "time" in entry:
+            number(str(path), f"time of {name!r}", entry["time"])
+    check_keys(str(path), (known, *frames), _KEYS)
+    return {**known, "frames": frames}
 
 
-def _present(folder: Path, path: Path, frames: list[dict[str, Any]], missing: Missing) -> list[dict[str, Any]]:
-    """The entries whose picture, video or folder is there; nerfstudio itself passes over the others, too."""
-    there = [entry for entry in frames if _file(folder, entry).exists()]
-    if len(there) == len(frames):
-        return there
-    first = next(entry["file_path"] for entry in frames if not _file(folder, entry).exists())
-    told = f"{path}: {len(frames) - len(there)} of {len(frames)} pictures are missing, the first is {first}"
-    if not there or missing == "refuse":
-        raise SourceError(f"{told}; restore them, or take them out of the file")
-    warnings.warn(
-        f"{told}; they are skipped, as nerfstudio does. To refuse them: --source 'nerfstudio:{folder}?missing=refuse'",
-        RecordingWarning,
-        stacklevel=2,
-    )
-    return there
+def _plain(name: str) -> str:
+    """A path as POSIX writes it: files made on Windows have backslashes, others begin with ./."""
+    return str(PurePosixPath(name.replace("\\", "/")))
 
 
-def _file(folder: Path, entry: dict[str, Any]) -> Path:
-    """The file or folder of an entry; Blender's scenes leave the suffix out."""
-    file: Path = folder / entry["file_path"]
-    return file if file.suffix or file.exists() else file.with_suffix(".png")
+def _present(
+    path: Path, frames: list[dict[str, Any]], files: dict[str, Path], missing: Missing
+) -> list[dict[str, Any]]:
+    """The entries whose pose and picture, video or folder are there; nerfstudio itself passes over the others, too."""
+    blind = [entry for entry in frames if not files[entry["file_path"]].exists()]
+    lost = [entry for entry in frames if "transform_matrix" not in entry]
+    kept = [entry for entry in frames if "transform_matrix" in entry and files[entry["file_path"]].exists()]
+    for bad, told in ((blind, "pictures are missing"), (lost, "entries have no transform_matrix")):
+        if not bad:
+            continue
+        told = f"{path}: {len(bad)} of {len(frames)} {told}, the first is {bad[0]['file_path']}"
+        if not kept or missing == "refuse":
+            raise SourceError(f"{told}; restore them, or take them out of the file")
+        warn(
+            f"{told}; they are skipped, as nerfstudio does, and {len(kept)} stay. To refuse them: --source "
+            f"'nerfstudio:{path.parent}?missing=refuse'"
+        )
+    return kept
 
 
-def _clip(folder: Path, entries: list[dict[str, Any]]) -> Clip:
-    files = [_file(folder, entry) for entry in entries]
+def _split(
+    path: Path, data: dict[str, Any], groups: dict[str, list[dict[str, Any]]]
+) -> tuple[dict[str, list[dict[str, Any]]], tuple[str, ...]]:
+    """The cameras that the lists of names leave, and those of them that are held out."""
+    train, val, test = (_listed(path, data, key) for key in _SPLITS)
+    held = (val or set()) | (test or set())
+    named = {name: {entry["file_path"] for entry in entries} for name, entries in groups.items()}
+    if train is None:
+        return groups, tuple(name for name, files in named.items() if files & held)
+    if both := [name for name, files in named.items() if files & held and files & train]:
+        raise SourceError(
+            f"{path}: camera {both[0]!r} is in train_filenames and in a list of pictures that are held out"
+        )
+    kept = {name: groups[name] for name, files in named.items() if files & (held | train)}
+    left_out(str(path), "that no list of file names holds", [n for n in groups if n not in kept], len(kept))
+    return kept, tuple(name for name in kept if named[name] & held)
+
+
+def _listed(path: Path, data: dict[str, Any], key: str) -> set[str] | None:
+    """The entries that a list names; None where there is no such list."""
+    names = data.get(key)
+    if names is None:
+        return None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise SourceError(f"{path}: {key} must be a list of file names, got {names!r:.60}")
+    files = [entry["file_path"] for entry in data["frames"]]
+    # Loosely: in another case, without a suffix.
+    known = {_loose(name): name for name in files} | {name: name for name in files}
+    found = {name: known.get(_plain(name), known.get(_loose(_plain(name)))) for name in names}
+    if unknown := [name for name, entry in found.items() if entry is None]:
+        raise SourceError(
+            f"{path}: {key}: {unknown[0]!r} is no file_path of an entry{suggest(unknown[0], files[:100])}"
+        )
+    return {name for name in found.values() if name is not None}
+
+
+def _loose(name: str) -> str:
+    suffix = PurePosixPath(name).suffix
+    return (name.removesuffix(suffix) if suffix.lower() in IMAGE_SUFFIXES else name).casefold()
+
+
+def _files(folder: Path, frames: list[dict[str, Any]]) -> dict[str, Path]:
+    """The file or folder of each file_path; Blender's scenes leave the suffix out, and some systems take any case."""
+    found: dict[str, Path] = {}
+    listed: dict[Path, dict[str, Path]] = {}
+    for name in (entry["file_path"] for entry in frames):
+        found[name] = file = folder / name
+        if file.exists() or not file.parent.is_dir():
+            continue
+        if file.parent not in listed:
+            inside = sorted(file.parent.iterdir(), reverse=True)
+            exact = {other.name.casefold(): other for other in inside}
+            listed[file.parent] = {_loose(other.name): other for other in inside} | exact
+        # A name with the suffix of a picture means no picture of another format.
+        key = file.name.casefold()
+        found[name] = listed[file.parent].get(key if file.suffix.lower() in IMAGE_SUFFIXES else _loose(key), file)
+    return found
+
+
+def _clip(files: list[Path]) -> Clip:
     if len(files) > 1:
         return ImageClip(files)
     if files[0].is_dir():
@@ -137,53 +222,74 @@ def _clip(folder: Path, entries: list[dict[str, Any]]) -> Clip:
 
 
 def _pose(path: Path, entry: dict[str, Any]) -> FloatArray:
-    name = entry["file_path"]
-    try:
-        pose = np.asarray(entry.get("transform_matrix"), np.float64)
-    except (TypeError, ValueError) as error:
-        raise SourceError(f"{path}: transform_matrix of {name!r} is not a matrix of numbers ({error})") from error
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise SourceError(f"{path}: transform_matrix of {name!r} must be a finite 4 x 4 matrix, got {list(pose.shape)}")
-    return pose
+    """Camera to world [4, 4]; some programs leave out the last row."""
+    key = f"transform_matrix of {entry['file_path']!r}"
+    return np.concatenate([matrix(str(path), key, entry["transform_matrix"], (4, 4), (3, 4)), [[0, 0, 0, 1.0]]])[:4]
 
 
-def _number(path: Path, data: dict[str, Any], key: str, name: str) -> float:
-    value = data[key]
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise SourceError(f"{path}: {key} of camera {name!r} must be a finite number, got {value!r}")
-    return float(value)
-
-
-def _intrinsics(path: Path, data: dict[str, Any], name: str, size: tuple[int, int]) -> FloatArray:
-    width, height = data.get("w", size[0]), data.get("h", size[1])
-    if "fl_x" in data:
-        fx = _number(path, data, "fl_x", name)
-        fy = _number(path, data, "fl_y", name) if "fl_y" in data else fx
-    elif "camera_angle_x" in data:
-        fx = fy = 0.5 * width / math.tan(0.5 * _number(path, data, "camera_angle_x", name))
-    else:
+def _camera(path: Path, data: dict[str, Any], name: str, pictures: tuple[int, int]) -> RigCamera:
+    where = str(path)
+    size = tuple(
+        pixels(where, f"{key} of camera {name!r}", data[key]) if key in data else side
+        for key, side in zip("wh", pictures, strict=True)
+    )
+    focal = {axis: _focal(where, data, axis=axis, side=side, name=name) for axis, side in zip("xy", size, strict=True)}
+    fx, fy = focal["x"] or focal["y"], focal["y"] or focal["x"]
+    if fx is None or fy is None:
         raise SourceError(f"{path}: camera {name!r} has neither fl_x nor camera_angle_x")
-    cx = _number(path, data, "cx", name) if "cx" in data else width / 2
-    cy = _number(path, data, "cy", name) if "cy" in data else height / 2
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    cx, cy = (
+        number(where, f"c{axis} of camera {name!r}", data[f"c{axis}"]) if f"c{axis}" in data else side / 2
+        for axis, side in zip("xy", size, strict=True)
+    )
+    return RigCamera(
+        name=name,
+        w2c=from_opengl(_pose(path, data)),
+        K=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]),
+        lens=_lens(where, data, name),
+        size=(size[0], size[1]),
+        border=0,
+    )
 
 
-def _lens(path: Path, data: dict[str, Any]) -> Lens | None:
-    model = data.get("camera_model", "OPENCV")
-    k = tuple(_number(path, data, key, data["file_path"]) if key in data else 0.0 for key in ("k1", "k2", "k3", "k4"))
-    p = tuple(_number(path, data, key, data["file_path"]) if key in data else 0.0 for key in ("p1", "p2"))
-    if model == "OPENCV_FISHEYE":
-        return Lens("fisheye", k)
-    if model != "OPENCV":
-        return None
-    if k[3]:
-        raise SourceError(f"{path}: k4 = {k[3]:g} with camera_model OPENCV; is it an OPENCV_FISHEYE?")
-    return Lens("radial", k[:3], (p[0], p[1]))
+def _focal(where: str, data: dict[str, Any], *, axis: str, side: int, name: str) -> float | None:
+    """Focal length in pixels of one axis, of the first key that is there."""
+    if (key := f"fl_{axis}") in data:
+        return number(where, f"{key} of camera {name!r}", data[key], above=0)
+    for key, full in ((f"camera_angle_{axis}", math.pi), (f"{axis}_fov", 180.0)):
+        if key in data:
+            told = f"an angle between 0 and {full:.5g}"
+            angle = number(where, f"{key} of camera {name!r}", data[key], above=0, below=full, expected=told)
+            return 0.5 * side / math.tan(0.5 * math.pi * angle / full)
+    return None
 
 
-def _points(folder: Path, data: dict[str, Any], cameras: int) -> SeenPoints | None:
-    name = data.get("ply_file_path")
-    if not isinstance(name, str) or not (folder / name).is_file():
+def _lens(where: str, data: dict[str, Any], name: str) -> Lens:
+    fisheye, model = data.get("is_fisheye"), data.get("camera_model")
+    if not isinstance(fisheye, bool | None):
+        raise SourceError(f"{where}: is_fisheye must be true or false, got {fisheye!r:.60}")
+    model = model or ("OPENCV_FISHEYE" if fisheye else "OPENCV")
+    if model not in _MODELS:
+        known = ", ".join(_MODELS)
+        raise SourceError(
+            f"{where}: camera_model {model!r} of camera {name!r} is not supported; expected one of {known}"
+        )
+    kind, radial, tangential = _MODELS[model]
+    if fisheye is not None and fisheye != (kind == "fisheye"):
+        raise SourceError(f"{where}: camera_model {model} of camera {name!r} contradicts is_fisheye {fisheye}")
+    values = {k: number(where, f"{k} of camera {name!r}", data[k]) for k in _COEFFICIENTS if k in data}
+    if lost := next((k for k, value in values.items() if value and k not in (*radial, *tangential)), None):
+        hint = (
+            "; is it an OPENCV_FISHEYE?"
+            if lost == "k4"
+            else f", which has {', '.join((*radial, *tangential)) or 'none'}"
+        )
+        raise SourceError(f"{where}: {lost} = {values[lost]:g} of camera {name!r} with camera_model {model}{hint}")
+    p1, p2 = values.get("p1", 0.0), values.get("p2", 0.0)
+    return Lens(kind, tuple(values.get(key, 0.0) for key in radial), (p1, p2))
+
+
+def _points(folder: Path, name: str | None, cameras: int) -> SeenPoints | None:
+    if name is None:
         return None
     cloud = read_ply_points(folder / name)
     return SeenPoints(cloud, np.ones((len(cloud), cameras), bool))

@@ -15,22 +15,11 @@ from gsstream.input.recordings.clips import natural_sort_key
 
 Entry = dict[str, Any]
 Pose = Callable[[Path, Entry], FloatArray]
-_INTRINSICS = (
-    "fl_x",
-    "fl_y",
-    "cx",
-    "cy",
-    "w",
-    "h",
-    "camera_angle_x",
-    "k1",
-    "k2",
-    "k3",
-    "k4",
-    "p1",
-    "p2",
-    "camera_model",
-)
+#: Keys of an entry that say how its camera sees.
+INTRINSICS = (
+    "fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov", "k1", "k2", "k3", "k4",
+    "k5", "k6", "p1", "p2", "camera_model", "is_fisheye",
+)  # fmt: skip
 
 
 def group_entries(path: Path, frames: list[Entry], pose: Pose) -> dict[str, list[Entry]]:
@@ -121,7 +110,7 @@ def _by_pose(path: Path, frames: list[Entry], pose: Pose) -> list[list[Entry]]:
 
 
 def _lens(entry: Entry) -> list[Any]:
-    return [entry.get(key) for key in _INTRINSICS]
+    return [entry.get(key) for key in INTRINSICS]
 
 
 def _named(groups: Sequence[list[Entry]]) -> dict[str, list[Entry]]:

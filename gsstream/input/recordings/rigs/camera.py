@@ -1,16 +1,22 @@
-"""One calibrated camera, as the readers of calibrations give it, and which pictures are its."""
+"""One calibrated camera, as the readers of calibrations give it, which pictures are its, and the rig of several."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
+from gsstream.input.recordings.clips import Clip
 from gsstream.input.recordings.lens import Lens
+from gsstream.input.recordings.foreign import warn
+from gsstream.input.recordings.recorded import Recording
 
 #: Pictures of a size that differs by less than this share lost or gained a border, and were not scaled.
 BORDER = 0.03
@@ -26,6 +32,7 @@ class RigCamera:
     K: FloatArray
     lens: Lens  # how rays bend
     size: tuple[int, int] | None  # (width, height) that K is for; None: not stored
+    border: float = BORDER  # share of the size that pictures may have lost or gained without being scaled
 
     def intrinsics(self, size: tuple[int, int]) -> FloatArray:
         """Return K for pictures of this size. Raises SourceError when they show another part of the view."""
@@ -37,12 +44,44 @@ class RigCamera:
         if abs(across - down) < 1e-3 * down:
             scaled: FloatArray = np.diag([across, down, 1.0]) @ self.K
             return scaled
-        if max(abs(across - 1), abs(down - 1)) < BORDER:
+        if max(abs(across - 1), abs(down - 1)) < self.border:
             return self.K
         raise SourceError(
             f"camera {self.name!r} is calibrated for pictures of {self.size[0]} x {self.size[1]}, but those found are "
             f"{size[0]} x {size[1]}: another part of the view; calibrate with pictures of that shape"
         )
+
+
+def assembled_rig(
+    folder: Path, where: Path, cameras: Mapping[str, RigCamera], clips: Mapping[str, Clip], **more: Any
+) -> Recording:
+    """Return the recording of these cameras, by the names of their clips; ``more`` are other fields of a recording.
+
+    Intrinsics are brought to the size of the pictures, which a warning says where that is another.
+    Raises SourceError for pictures that show another part of the view.
+    """
+    sizes = {name: clip.size for name, clip in clips.items()}
+    try:
+        Ks = np.stack([cameras[name].intrinsics(size) for name, size in sizes.items()])
+    except SourceError as error:
+        raise SourceError(f"{where}: {error}") from error
+    other = {name: cameras[name].size for name, size in sizes.items() if cameras[name].size not in (None, size)}
+    if other:
+        name, stated = next((name, size) for name, size in other.items() if size is not None)
+        warn(
+            f"{where}: {len(other)} of {len(sizes)} cameras are calibrated for another size than their pictures have "
+            f"({name}: {stated[0]} x {stated[1]} for {sizes[name][0]} x {sizes[name][1]}); the intrinsics are brought "
+            "to the size of the pictures"
+        )
+    return Recording(
+        name=folder.resolve().name,
+        where=str(where),
+        rig=Cameras(tuple(clips), np.stack([cameras[name].w2c for name in clips]), Ks, *next(iter(sizes.values()))),
+        clips=clips,
+        lenses={name: cameras[name].lens for name in clips if not cameras[name].lens.is_identity},
+        sizes=sizes,
+        **more,
+    )
 
 
 def opencv_lens(values: Sequence[float], fisheye: bool, where: str) -> Lens:

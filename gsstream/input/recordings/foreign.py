@@ -1,0 +1,132 @@
+"""Files of other programs: no key is passed over in silence, and no number is used before it is checked.
+
+Every message names file and key, and is one sentence.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gsstream.core.errors import SourceError, suggest
+from gsstream.core.shapes import FloatArray
+from gsstream.input.recordings.sync import RecordingWarning
+
+#: Pictures with a longer side do not exist.
+MAX_SIDE = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """What a format may hold. A trailing ``*`` stands for any ending, such as the name of a camera."""
+
+    read: tuple[str, ...]
+    #: Known, and without effect on poses, lenses, times and points.
+    idle: tuple[str, ...] = ()
+    #: They say how to read numbers, and gsstream does not: refused unless they say nothing (zero, false, null, empty).
+    refused: tuple[str, ...] = ()
+
+
+def check_keys(where: str, found: Iterable[Mapping[str, Any]], known: Keys) -> None:
+    """Warn of keys that no list holds, with the nearest known name; these objects are of one kind.
+
+    Raises SourceError for a refused key that says something, and for another spelling of a key that is read.
+    """
+    unknown: dict[str, None] = {}
+    spelled = {_bare(key): key for key in known.read if not key.endswith("*")}
+    for entry in found:
+        for key, value in entry.items():
+            if _fits(key, known.refused):
+                if _says(value):
+                    told = f"{where}: {key!r} is not supported, and says how to read the file, got {brief(value)}"
+                    raise SourceError(f"{told}: export without this key, or undistort the pictures")
+            elif not _fits(key, known.read) and not _fits(key, known.idle):
+                if near := spelled.get(_bare(key)):
+                    raise SourceError(f"{where}: the key {key!r} is not known; did you mean {near!r}?")
+                unknown[key] = None
+    if unknown:
+        names = [key.rstrip("*") for key in (*known.read, *known.idle)]
+        near = suggest(next(iter(unknown)), names) if len(unknown) == 1 else ""
+        told = ", ".join(f"{key!r}" for key in list(unknown)[:8]) + (", ..." if len(unknown) > 8 else "")
+        near = near if "did you mean" in near else ""
+        warn(f"{where}: keys that are not known have no effect: {told}{near}")
+
+
+def _fits(key: str, names: Sequence[str]) -> bool:
+    return any(key.startswith(name[:-1]) if name.endswith("*") else key == name for name in names)
+
+
+def _bare(key: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", key.lower())
+
+
+def _says(value: Any) -> bool:
+    """Whether a value says more than that there is nothing to say."""
+    if isinstance(value, Mapping | list | tuple):
+        return any(_says(item) for item in (value.values() if isinstance(value, Mapping) else value))
+    try:
+        return float(value) != 0
+    except (TypeError, ValueError, OverflowError):
+        return str(value).lower() not in ("", "none", "null", "false")
+
+
+def warn(told: str) -> None:
+    """Warn of something in a recording that deserves a look."""
+    warnings.warn(told, RecordingWarning, stacklevel=3)
+
+
+def left_out(where: str, why: str, names: Sequence[str], stay: int, *, what: str = "cameras") -> None:
+    """Warn of cameras that are only half there, with those that stay. Raises SourceError where none stay."""
+    if not names:
+        return
+    told = f"{where}: {what} {why} are left out: {', '.join(names)}; {stay} of {stay + len(names)} stay"
+    if not stay:
+        raise SourceError(f"{told}: restore what is missing")
+    warn(told)
+
+
+def number(
+    where: str, key: str, value: Any, *, above: float = -math.inf, below: float = math.inf, expected: str = ""
+) -> float:
+    """Return a finite number between bounds that are left out. Raises SourceError for anything else, texts included."""
+    good = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+    if not good or not above < value < below:
+        expected = expected or ("a positive number" if above == 0 else "a finite number")
+        raise SourceError(f"{where}: {key} must be {expected}, got {brief(value)}")
+    return float(value)
+
+
+def pixels(where: str, key: str, value: Any) -> int:
+    """Return a whole number of pixels, at least 1. Raises SourceError for anything else."""
+    side = number(where, key, value, above=0, below=MAX_SIDE + 1, expected=f"whole pixels from 1 to {MAX_SIDE}")
+    if side != int(side):
+        raise SourceError(f"{where}: {key} must be whole pixels from 1 to {MAX_SIDE}, got {brief(value)}")
+    return int(side)
+
+
+def matrix(where: str, key: str, value: Any, *shapes: tuple[int, ...]) -> FloatArray:
+    """Return finite numbers of one of these shapes, float64. Raises SourceError for anything else, texts included."""
+    told = f"{where}: {key} must be {' or '.join(' x '.join(map(str, shape)) for shape in shapes)} finite numbers"
+    try:
+        cells = np.array(value, dtype=object)
+    except ValueError as error:
+        raise SourceError(f"{told}, got lists of different lengths") from error
+    if cells.shape not in shapes:
+        raise SourceError(f"{told}, got {list(cells.shape) if cells.shape else brief(value)}")
+    for cell in cells.flat:
+        number(where, f"{key}: every element", cell)
+    return cells.astype(np.float64)
+
+
+def brief(value: Any) -> str:
+    """Return a value as a message shows it."""
+    if isinstance(value, int) and abs(value) >= 10**60:
+        return "a number of more than 60 digits"
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

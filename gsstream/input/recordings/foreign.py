@@ -124,6 +124,21 @@ def matrix(where: str, key: str, value: Any, *shapes: tuple[int, ...]) -> FloatA
     return cells.astype(np.float64)
 
 
+def parsed(where: str, key: str, words: Sequence[Any], *counts: int) -> FloatArray:
+    """Return the finite numbers that texts stand for, as many as one of ``counts`` (any number where there is none).
+
+    Raises SourceError for anything else.
+    """
+    try:
+        values = np.array([float(word) for word in words], np.float64)
+    except (TypeError, ValueError) as error:
+        raise SourceError(f"{where}: {key} holds something that is not a number ({error})") from error
+    if (counts and len(values) not in counts) or not np.isfinite(values).all():
+        expected = f"{' or '.join(map(str, counts))} finite numbers" if counts else "finite numbers"
+        raise SourceError(f"{where}: {key} must hold {expected}, got {brief(list(words))}")
+    return values
+
+
 def brief(value: Any) -> str:
     """Return a value as a message shows it."""
     if isinstance(value, int) and abs(value) >= 10**60:

@@ -13,6 +13,10 @@ from gsstream.core.install_hints import require_encoder
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.images import shrink
 
+_COLMAP = (
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_FISHEYE", "FISHEYE",
+    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE",
+)  # fmt: skip
 _SIDES, _RINGS = 64, 24
 #: Bounds of the new focal length, as a factor: pictures are not stretched or cut more than this.
 _WIDEST, _NARROWEST = 0.25, 2.0
@@ -62,6 +66,8 @@ def from_colmap(model: str, params: Sequence[float], where: str) -> tuple[FloatA
     Raises SourceError for models whose lens gsstream does not know.
     """
     p = tuple(map(float, params))
+    if model not in _COLMAP:
+        raise SourceError(f"{where}: the model {model} is not supported; undistort with COLMAP's own tool")
     single = model.startswith(("SIMPLE_", "RADIAL"))
     fx, fy, cx, cy = (p[0], p[0], p[1], p[2]) if single else p[:4]
     rest = p[3:] if single else p[4:]
@@ -74,10 +80,8 @@ def from_colmap(model: str, params: Sequence[float], where: str) -> tuple[FloatA
             lens = Lens("radial", rest[:2], (rest[2], rest[3]))
         case "FULL_OPENCV":
             lens = Lens("radial", (*rest[:2], *rest[4:8]), (rest[2], rest[3]))
-        case "OPENCV_FISHEYE" | "SIMPLE_RADIAL_FISHEYE" | "RADIAL_FISHEYE":
-            lens = Lens("fisheye", rest)
         case _:
-            raise SourceError(f"{where}: the model {model} is not supported; undistort with COLMAP's own tool")
+            lens = Lens("fisheye", rest)
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), lens
 
 

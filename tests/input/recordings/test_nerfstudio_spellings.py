@@ -154,8 +154,8 @@ def test_names_are_found_as_people_write_them(tmp_path: Path, world: World, name
         data["test_filenames"] = [listed.replace("png", suffix)]
 
     source = open_source(still(tmp_path / "n", world, spelled, suffix))
-    assert source.info.test.ids == ("cam3",)
-    assert source.info.train.ids == ("cam0", "cam1", "cam2")
+    assert [camera.lower() for camera in source.info.test.ids] == ["cam3"]
+    assert [camera.lower() for camera in source.info.train.ids] == ["cam0", "cam1", "cam2"]
     assert source.frame(0).images.shape[0] == 3
 
 

@@ -7,17 +7,17 @@ folder with videos. There are no test cameras unless ``data.test_cameras`` names
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
-from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, images_in
+from gsstream.input.recordings.foreign import left_out
 from gsstream.input.recordings.recorded import Recording
 from gsstream.input.recordings.rigs import metashape, opencv_yaml, qualisys, realitycapture, toml
-from gsstream.input.recordings.rigs.camera import RigCamera, matched
+from gsstream.input.recordings.rigs.camera import RigCamera, assembled_rig, matched
+from gsstream.input.recordings.sync import RecordingWarning
 
 READERS = (qualisys, toml, opencv_yaml, metashape, realitycapture)
 PLACES = (".", "calibration", "images")
@@ -27,11 +27,13 @@ LARGEST = 1 << 24
 
 def looks_like(folder: Path) -> bool:
     """Say whether a file holds a calibration of two cameras or more, or several files one camera each."""
-    return any(sum(len(found) for _, found in files) > 1 for files in _found(folder))
+    with warnings.catch_warnings():  # reading says it
+        warnings.simplefilter("ignore", RecordingWarning)
+        return any(sum(len(found) for _, found in files) > 1 for files in _found(folder))
 
 
 def read(folder: Path) -> Recording:
-    """Read poses and lenses, and find the pictures of their cameras; those without pictures are left out."""
+    """Read poses and lenses, and find the pictures of their cameras; those that are only half there are left out."""
     rigs = [files for files in _found(folder) if sum(len(found) for _, found in files) > 1]
     if not rigs:
         raise SourceError(f"{folder}: no calibration of two cameras or more, here or in calibration/")
@@ -42,22 +44,17 @@ def read(folder: Path) -> Recording:
     # A file with a whole rig stands for itself; files of one camera each belong together.
     cameras = first if len(first) > 1 else [camera for _, found in rigs[0] for camera in found]
     known = {camera.name: camera for camera in cameras}
+    if len(known) < len(cameras):
+        raise SourceError(f"{path}: two cameras have one name: {', '.join(camera.name for camera in cameras)}")
     clips = _clips(folder)
     try:
         names = matched(tuple(known), tuple(clips))
-        Ks = [known[names[name]].intrinsics(clip.size) for name, clip in clips.items()]
     except SourceError as error:
         raise SourceError(f"{path}: {error}") from error
-    sizes = {name: clip.size for name, clip in clips.items()}
-    poses = np.stack([known[names[name]].w2c for name in clips])
-    return Recording(
-        name=folder.resolve().name,
-        where=str(path),
-        rig=Cameras(tuple(clips), poses, np.stack(Ks), *next(iter(sizes.values()))),
-        clips=clips,
-        lenses={name: known[names[name]].lens for name in clips if not known[names[name]].lens.is_identity},
-        sizes=sizes,
-    )
+    left_out(str(path), "without pictures", [name for name in known if name not in names.values()], len(names))
+    left_out(str(path), "without a calibration", [name for name in clips if name not in names], len(names))
+    seen = {name: clip for name, clip in clips.items() if name in names}
+    return assembled_rig(folder, path, {name: known[names[name]] for name in seen}, seen)
 
 
 def _found(folder: Path) -> Iterator[list[tuple[Path, list[RigCamera]]]]:

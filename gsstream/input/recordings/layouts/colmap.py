@@ -1,5 +1,7 @@
 """A COLMAP model of frame 0 with the frames of its cameras: sparse/0/ beside images/, or beside videos.
 
+Of several models (sparse/0/, sparse/1/, ...) the one with the most images is read.
+
 The model's images are the cameras. A camera is named after its image's own folder (``cam00/000000.png`` -> cam00) when
 every image has one, else after the image (``cam00.png`` -> cam00). Its frames are the first of these that is there:
 ``images/NAME/*.png``, ``frames/NAME/*.png``, ``videos/NAME.mp4``, ``images/NAME.mp4``, ``NAME.mp4``, and else the image
@@ -12,11 +14,11 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import PointCloud
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, images_in
+from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, images_in, natural_sort_key
+from gsstream.input.recordings.foreign import left_out, warn
 from gsstream.input.recordings.layouts.colmap_model import (
     ModelImage,
     has_model,
@@ -28,51 +30,73 @@ from gsstream.input.recordings.layouts.colmap_model import (
 from gsstream.input.recordings.lens import from_colmap
 from gsstream.input.recordings.poses import from_quaternion
 from gsstream.input.recordings.recorded import Recording, SeenPoints
-
-_PLACES = ("sparse/0", "sparse", ".")
+from gsstream.input.recordings.rigs.camera import RigCamera, assembled_rig
 
 
 def looks_like(folder: Path) -> bool:
-    """Say whether cameras and images (.bin or .txt) lie in sparse/0/ or sparse/."""
-    return any(has_model(folder / place) for place in _PLACES)
+    """Say whether cameras and images (.bin or .txt) lie in sparse/NUMBER/ or sparse/."""
+    return any(has_model(place) for place in _places(folder))
+
+
+def _places(folder: Path) -> list[Path]:
+    """Where a model may lie; a mapper that split leaves several beside each other."""
+    inside = [p for p in (folder / "sparse").glob("*") if p.name.isdigit()]
+    return [*sorted(inside, key=natural_sort_key), folder / "sparse", folder]
 
 
 def read(folder: Path) -> Recording:
-    """Read a COLMAP model; cameras with distortion are undistorted on reading.
+    """Read a COLMAP model, of several the one with the most images; cameras with distortion are undistorted on reading.
 
     A point counts as seen by the images of its track.
     """
-    model = next((folder / place for place in _PLACES if has_model(folder / place)), None)
-    if model is None:
-        raise SourceError(f"{folder}: no COLMAP model; expected cameras and images (.bin or .txt) in sparse/0/")
-    cameras, images = read_cameras(model), read_images(model)
-    if not images:
-        raise SourceError(f"{model}: the model has no registered images")
+    model, images = _largest(folder)
+    cameras = read_cameras(model)
     numbers = sorted(images, key=lambda number: images[number].name)
     names = _names(model, [images[number].name for number in numbers])
-    poses, Ks, lenses, sizes = [], [], {}, {}
+    rig, clips = dict[str, RigCamera](), dict[str, Clip]()
     for name, number in zip(names, numbers, strict=True):
         image = images[number]
         if image.camera not in cameras:
             raise SourceError(f"{model}: image {image.name!r} uses camera {image.camera}, which is not in the model")
         camera = cameras[image.camera]
-        poses.append(from_quaternion(_unit(model, image), image.translation))
         K, lens = from_colmap(camera.model, camera.params, f"{model}: camera {image.camera}")
-        Ks.append(K)
-        sizes[name] = (camera.width, camera.height)
-        if not lens.is_identity:
-            lenses[name] = lens
-    rig = Cameras(tuple(names), np.stack(poses), np.stack(Ks), *sizes[names[0]])
-    clips = {name: _clip(folder, name, images[number].name) for name, number in zip(names, numbers, strict=True)}
-    return Recording(
-        name=folder.resolve().name,
-        where=str(model),
-        rig=rig,
-        clips=clips,
-        lenses=lenses,
-        sizes=sizes,
-        points=lambda _: _points(model, numbers),
-    )
+        pose = from_quaternion(_unit(model, image), image.translation)
+        rig[name] = RigCamera(name=name, w2c=pose, K=K, lens=lens, size=(camera.width, camera.height), border=0)
+        if (clip := _clip(folder, name, image.name)) is not None:
+            clips[name] = clip
+    left_out(str(model), "without pictures", [name for name in names if name not in clips], len(clips))
+    _say_unused(folder, model, [images[number].name for number in numbers], clips)
+    kept = [number for name, number in zip(names, numbers, strict=True) if name in clips]
+    return assembled_rig(folder, model, rig, clips, points=lambda _: _points(model, kept))
+
+
+def _largest(folder: Path) -> tuple[Path, dict[int, ModelImage]]:
+    """The model with the most images and those; a warning names the others."""
+    models = {place: read_images(place) for place in _places(folder) if has_model(place)}
+    if not models:
+        raise SourceError(f"{folder}: no COLMAP model; expected cameras and images (.bin or .txt) in sparse/0/")
+    best = max(models, key=lambda place: len(models[place]))
+    if not models[best]:
+        raise SourceError(f"{best}: the model has no registered images")
+    if len(models) > 1:
+        told = ", ".join(f"{place.relative_to(folder)} has {len(images)} images" for place, images in models.items())
+        warn(f"{folder}: several models: {told}; {best.relative_to(folder)} is read: delete the others, or merge them")
+    return best, models[best]
+
+
+def _say_unused(folder: Path, model: Path, images: list[str], clips: dict[str, Clip]) -> None:
+    """Warn of pictures that no camera of the model takes."""
+    taken = {PurePosixPath(name).parts[0] for name in images if "/" in name} | set(clips)
+    places = [place for place in (folder / "images", folder / "frames", folder / "videos") if place.is_dir()]
+    inside = [path for place in places for path in sorted(place.iterdir())]
+    other = [p.name for p in inside if p.is_dir() and p.name not in taken and images_in(p)]
+    other += [p.name for p in inside if p.suffix.lower() in VIDEO_SUFFIXES and p.stem not in taken]
+    # A picture beside those of the model is another view, or another instant, of which a model of frame 0 says nothing.
+    if flat := {PurePosixPath(name).name for name in images if "/" not in name}:
+        other += [p.name for p in images_in(folder / "images") if p.name not in flat]
+    if other:
+        some = ", ".join(other[:8]) + (", ..." if len(other) > 8 else "")
+        warn(f"{model}: pictures without a pose are left out: {some} ({len(other)}); {len(clips)} cameras stay")
 
 
 def _unit(model: Path, image: ModelImage) -> FloatArray:
@@ -98,7 +122,7 @@ def _names(model: Path, files: list[str]) -> list[str]:
     )
 
 
-def _clip(folder: Path, name: str, image: str) -> Clip:
+def _clip(folder: Path, name: str, image: str) -> Clip | None:
     for place in (folder / "images" / name, folder / "frames" / name):
         if images_in(place):
             return folder_clip(place)
@@ -109,12 +133,7 @@ def _clip(folder: Path, name: str, image: str) -> Clip:
 
                 return VideoClip(path)
     path = folder / "images" / image
-    if not path.is_file():
-        raise SourceError(
-            f"{folder}: no frames of camera {name!r}; expected images/{name}/, frames/{name}/, videos/{name}.mp4 or "
-            f"images/{image}"
-        )
-    return ImageClip([path])
+    return ImageClip([path]) if path.is_file() else None
 
 
 def _points(model: Path, numbers: list[int]) -> SeenPoints | None:

@@ -17,12 +17,15 @@ import numpy as np
 
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
+from gsstream.input.recordings.foreign import MAX_SIDE
 
 #: Number in .bin files -> name and number of parameters.
 MODELS = {
     0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
     5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12),
+    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12), 11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4), 13: ("DIVISION", 5), 14: ("SIMPLE_FISHEYE", 3), 15: ("FISHEYE", 4), 16: ("EUCM", 6),
+    17: ("EQUIRECTANGULAR", 2),
 }  # fmt: skip
 _POINT = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 _TRACK = np.dtype([("image", "<i4"), ("point", "<i4")])
@@ -105,7 +108,8 @@ def read_cameras(folder: Path) -> dict[int, ModelCamera]:
             if model not in MODELS:
                 raise SourceError(f"{path}: camera {number} has the unknown model number {model}")
             name, size = MODELS[model]
-            cameras[number] = ModelCamera(name, width, height, file.take(f"<{size}d"))
+            with _parsing(path, number):
+                cameras[number] = _camera(name, width, height, file.take(f"<{size}d"))
         return cameras
     sizes = dict(MODELS.values())
     for where, words in _lines(path):
@@ -114,8 +118,14 @@ def read_cameras(folder: Path) -> dict[int, ModelCamera]:
             params = tuple(float(word) for word in words[4:])
             if sizes.get(name) != len(params):
                 raise ValueError(f"model {name} with {len(params)} parameters")
-            cameras[number] = ModelCamera(name, width, height, params)
+            cameras[number] = _camera(name, width, height, params)
     return cameras
+
+
+def _camera(model: str, width: int, height: int, params: tuple[float, ...]) -> ModelCamera:
+    if not np.isfinite(params).all() or not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise ValueError(f"a camera of {width} x {height} pixels with the parameters {params}")
+    return ModelCamera(model, width, height, params)
 
 
 def read_images(folder: Path) -> dict[int, ModelImage]:
@@ -130,17 +140,34 @@ def read_images(folder: Path) -> dict[int, ModelImage]:
             file.array(_POINT, file.count(_POINT.itemsize))
             images[number] = ModelImage(name, camera, np.array(pose[:4]), np.array(pose[4:]))
         return images
-    # Two lines per image; the second, its points, may be empty.
-    lines = [(i, line) for i, line in enumerate(_text(path).split("\n"), 1) if not line.startswith("#")]
-    for where, line in lines[::2]:
-        if not line.strip():
+    # Two lines per image, of which the second, its points, may be empty; written by hand, it may be left out.
+    after_pose = False
+    for where, line in enumerate(_text(path).split("\n"), 1):
+        if line.startswith("#") or not line.strip():
+            after_pose = after_pose and line.startswith("#")
+            continue
+        if after_pose and _is_points(line.split()):
+            after_pose = False
             continue
         words = line.split(maxsplit=9)
+        after_pose = True
         with _parsing(path, where):
             pose = [float(word) for word in words[1:8]]
             image = ModelImage(words[9].strip(), int(words[8]), np.array(pose[:4]), np.array(pose[4:]))
+            if int(words[0]) in images:
+                raise ValueError(f"image {words[0]} is there twice")
+            if not np.isfinite(pose).all():
+                raise ValueError("the pose is not finite")
             images[int(words[0])] = image
     return images
+
+
+def _is_points(words: list[str]) -> bool:
+    """Whether a line holds the points of an image: triples of numbers, the last of each whole."""
+    try:
+        return len(words) % 3 == 0 and bool([[float(word) for word in words], [int(word) for word in words[2::3]]])
+    except ValueError:
+        return False
 
 
 def read_points(folder: Path) -> ModelPoints:

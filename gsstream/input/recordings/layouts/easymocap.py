@@ -1,29 +1,31 @@
 """ENeRF-Outdoor and other EasyMocap recordings: intri.yml, extri.yml, images/00/000000.jpg (or videos/00.mp4).
 
 OpenCV file storage. ``names``: camera ids. intri.yml: ``K_00`` 3 x 3 in pixels with (0, 0) in the *centre* of the first
-pixel (OpenCV's convention; half a pixel is added on reading), ``dist_00`` k1, k2, p1, p2, k3. extri.yml: ``Rot_00``
-3 x 3 (or ``R_00``, a rotation vector) and ``T_00``: world to camera, OpenCV axes, usually metres.
+pixel (OpenCV's convention; half a pixel is added on reading), ``dist_00`` (or ``D_00``) k1, k2, p1, p2, k3, ..., and
+``W_00``, ``H_00``, the size that K is for, where it is not that of the pictures. extri.yml: ``Rot_00`` 3 x 3 (or
+``R_00``, a rotation vector) and ``T_00``: world to camera, OpenCV axes, usually metres.
 """
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, folder_clip
-from gsstream.input.recordings.lens import Lens
+from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, folder_clip, images_in
+from gsstream.input.recordings.foreign import Keys, check_keys, left_out, parsed, pixels
 from gsstream.input.recordings.poses import from_pixel_centers, from_rotation_vector
 from gsstream.input.recordings.recorded import Recording
+from gsstream.input.recordings.rigs.camera import RigCamera, assembled_rig, opencv_lens
 from gsstream.input.recordings.rigs.opencv_yaml import load_storage
-from gsstream.input.recordings.sync import RecordingWarning
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
+#: By the writers of EasyMocap and EasyVolcap; near and far planes, bounds and colour matrices belong to rendering.
+_INTRI = Keys(read=("names", "K_*", "dist_*", "D_*", "W_*", "H_*"), idle=("ccm_*",), refused=("xi_*", "model_*"))
+_EXTRI = Keys(read=("names", "Rot_*", "R_*", "T_*"), idle=("t_*", "n_*", "f_*", "bounds_*"), refused=("RT_*",))
 
 
 def looks_like(folder: Path) -> bool:
@@ -34,34 +36,23 @@ def looks_like(folder: Path) -> bool:
 def read(folder: Path) -> Recording:
     """Read ENeRF-Outdoor: 18 cameras, 1920 x 1080, 30 frames per second; the test camera is the first, 00 (paper)."""
     intri, extri = load_storage(folder / INTRINSICS), load_storage(folder / EXTRINSICS)
+    path = folder / INTRINSICS
     names = intri.get("names")
     if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
-        raise SourceError(f"{folder / INTRINSICS}: 'names' must list the cameras")
-    clips = {n: clip for n in sorted(names) if (clip := _clip_of(folder, n)) is not None}
+        raise SourceError(f"{path}: 'names' must list the cameras")
+    check_keys(str(path), [intri], _INTRI)
+    check_keys(str(folder / EXTRINSICS), [extri], _EXTRI)
+    inside = [p.name for p in (folder / "images").glob("*") if images_in(p)]
+    clips = {n: clip for n in sorted({*names, *inside}) if (clip := _clip_of(folder, n)) is not None}
     if not clips:
         raise SourceError(f"{folder}: no pictures of any camera; expected images/NAME/000000.jpg or videos/NAME.mp4")
-    if blind := sorted(set(names) - set(clips)):
-        note = f"{folder / INTRINSICS}: cameras without pictures are left out: {', '.join(blind)}"
-        warnings.warn(note, RecordingWarning, stacklevel=2)
-    names = list(clips)
-    poses, Ks, lenses = [], [], {}
-    for name in names:
-        Ks.append(from_pixel_centers(_matrix(folder / INTRINSICS, intri, f"K_{name}", (3, 3))))
-        poses.append(_pose(folder / EXTRINSICS, extri, name))
-        lens = _lens(folder / INTRINSICS, intri, name)
-        if lens is not None and not lens.is_identity:
-            lenses[name] = lens
-    rig = Cameras(tuple(names), np.stack(poses), np.stack(Ks), *clips[names[0]].size)
-    return Recording(
-        name=folder.resolve().name,
-        where=str(folder / INTRINSICS),
-        rig=rig,
-        clips=clips,
-        test=(names[0],),
-        lenses=lenses,
-        sizes={name: clip.size for name, clip in clips.items()},
-        licence="see the data set",
-    )
+    cameras = {name: _camera(folder, intri, extri, name=name, pictures=clip.size) for name, clip in clips.items()}
+    known = {name: camera for name, camera in cameras.items() if camera is not None}
+    left_out(str(path), "without pictures", sorted(set(names) - set(clips)), len(clips))
+    lost = [name for name in clips if name not in known]
+    left_out(str(path), "without one of K, Rot (or R) and T", lost, len(known))
+    seen = {name: clips[name] for name in known}
+    return assembled_rig(folder, path, known, seen, test=(next(iter(seen)),), licence="see the data set")
 
 
 def _clip_of(folder: Path, name: str) -> Clip | None:
@@ -75,37 +66,33 @@ def _clip_of(folder: Path, name: str) -> Clip | None:
     return None
 
 
-def _matrix(path: Path, data: dict[str, Any], key: str, shape: tuple[int, ...]) -> FloatArray:
-    entry = data.get(key)
-    values = entry.get("data") if isinstance(entry, dict) else None
-    if values is None:
-        raise SourceError(f"{path}: no matrix {key!r}; every camera in 'names' needs one")
-    try:
-        matrix = np.array([float(v) for v in values])
-    except (TypeError, ValueError) as error:
-        raise SourceError(f"{path}: {key!r} holds something that is not a number ({error})") from error
-    if matrix.size != np.prod(shape):
-        raise SourceError(f"{path}: {key!r} must hold {int(np.prod(shape))} numbers, got {matrix.size}")
-    return matrix.reshape(shape)
+def _camera(
+    folder: Path, intri: dict[str, Any], extri: dict[str, Any], *, name: str, pictures: tuple[int, int]
+) -> RigCamera | None:
+    """The camera of a name; None where its matrix or its pose is not there."""
+    turns = [key for key in (f"Rot_{name}", f"R_{name}") if key in extri]
+    if f"K_{name}" not in intri or f"T_{name}" not in extri or not turns:
+        return None
+    inner, outer = str(folder / INTRINSICS), str(folder / EXTRINSICS)
+    turn = _numbers(outer, extri, turns[0], 9 if turns[0].startswith("Rot") else 3)
+    w2c = np.eye(4)
+    w2c[:3, :3] = from_rotation_vector(turn) if len(turn) == 3 else turn.reshape(3, 3)
+    w2c[:3, 3] = _numbers(outer, extri, f"T_{name}", 3)
+    bent = next((key for key in (f"dist_{name}", f"D_{name}") if key in intri), None)
+    coefficients = [] if bent is None else _numbers(inner, intri, bent).tolist()
+    stated = [key for key in (f"W_{name}", f"H_{name}") if key in intri]
+    sides = [pixels(inner, key, float(_numbers(inner, intri, key, 1)[0])) for key in stated]
+    return RigCamera(
+        name=name,
+        w2c=w2c,
+        K=from_pixel_centers(_numbers(inner, intri, f"K_{name}", 9).reshape(3, 3)),
+        lens=opencv_lens(coefficients, False, f"{inner}: {bent}"),
+        size=(sides[0], sides[1]) if len(sides) == 2 else pictures,
+        border=0,
+    )
 
 
-def _pose(path: Path, data: dict[str, Any], name: str) -> FloatArray:
-    pose = np.eye(4)
-    if f"Rot_{name}" in data:
-        pose[:3, :3] = _matrix(path, data, f"Rot_{name}", (3, 3))
-    else:
-        pose[:3, :3] = from_rotation_vector(_matrix(path, data, f"R_{name}", (3,)))
-    pose[:3, 3] = _matrix(path, data, f"T_{name}", (3,))
-    return pose
-
-
-def _lens(path: Path, data: dict[str, Any], name: str) -> Lens | None:
-    for key in (f"dist_{name}", f"D_{name}"):
-        entry = data.get(key)
-        if isinstance(entry, dict):
-            count = len(entry.get("data") or ())
-            if count not in (4, 5):
-                raise SourceError(f"{path}: {key!r} must hold k1, k2, p1, p2 and maybe k3, got {count} numbers")
-            k1, k2, p1, p2, *k3 = _matrix(path, data, key, (count,)).tolist()
-            return Lens("radial", (k1, k2, *k3), (p1, p2))
-    return None
+def _numbers(where: str, data: dict[str, Any], key: str, *counts: int) -> FloatArray:
+    entry = data[key]
+    values = entry.get("data", ()) if isinstance(entry, dict) else entry
+    return parsed(where, key, values if isinstance(values, list) else [values], *counts)

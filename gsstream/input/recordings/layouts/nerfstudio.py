@@ -24,9 +24,9 @@ from gsstream.core.errors import SourceError, suggest
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.calibration import read_json
 from gsstream.input.recordings.clips import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Clip, ImageClip, folder_clip
-from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.foreign import Keys, check_keys, left_out, matrix, number, pixels, warn
 from gsstream.input.recordings.layouts.nerfstudio_groups import INTRINSICS, group_entries
+from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.pointfiles import read_ply_points
 from gsstream.input.recordings.poses import from_opengl
 from gsstream.input.recordings.recorded import Recording, SeenPoints
@@ -52,7 +52,7 @@ _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 #: null counts as not given.
 _OPTIONAL = ("w", "h", "fps", "time", "camera_model", "is_fisheye", "transform_matrix", "ply_file_path", *_SPLITS)
-#: Of nerfstudio 1.1, instant-ngp 2 and exporters for Blender; what has no effect there belongs to training or to masks.
+#: Of nerfstudio, instant-ngp and exporters for Blender; what has no effect there belongs to training or to masks.
 _KEYS = Keys(
     read=(*INTRINSICS, "fps", "time", "frames", "file_path", "transform_matrix", "ply_file_path", *_SPLITS),
     idle=(

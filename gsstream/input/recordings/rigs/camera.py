@@ -14,8 +14,8 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.clips import Clip
+from gsstream.input.recordings.foreign import left_out, warn
 from gsstream.input.recordings.lens import Lens
-from gsstream.input.recordings.foreign import warn
 from gsstream.input.recordings.recorded import Recording
 
 #: Pictures of a size that differs by less than this share lost or gained a border, and were not scaled.
@@ -27,7 +27,7 @@ class RigCamera:
     """Pose and lens."""
 
     name: str  # in the calibration; that of the pictures may differ
-    w2c: FloatArray  # [4, 4] world to camera, OpenCV axes
+    w2c: FloatArray | None  # [4, 4] world to camera, OpenCV axes; None: only its lens is calibrated
     #: [3, 3] pixels, corner origin; without a size: in units of the longer side, from the middle of the picture.
     K: FloatArray
     lens: Lens  # how rays bend
@@ -60,6 +60,9 @@ def assembled_rig(
     Intrinsics are brought to the size of the pictures, which a warning says where that is another.
     Raises SourceError for pictures that show another part of the view.
     """
+    flat = [name for name in clips if cameras[name].w2c is None]
+    clips = {name: clip for name, clip in clips.items() if name not in flat}
+    left_out(str(where), "without a pose (calibrate the rig, too: only their lenses are known)", flat, len(clips))
     sizes = {name: clip.size for name, clip in clips.items()}
     try:
         Ks = np.stack([cameras[name].intrinsics(size) for name, size in sizes.items()])
@@ -73,10 +76,11 @@ def assembled_rig(
             f"({name}: {stated[0]} x {stated[1]} for {sizes[name][0]} x {sizes[name][1]}); the intrinsics are brought "
             "to the size of the pictures"
         )
+    poses = [w2c for name in clips if (w2c := cameras[name].w2c) is not None]
     return Recording(
         name=folder.resolve().name,
         where=str(where),
-        rig=Cameras(tuple(clips), np.stack([cameras[name].w2c for name in clips]), Ks, *next(iter(sizes.values()))),
+        rig=Cameras(tuple(clips), np.stack(poses), Ks, *next(iter(sizes.values()))),
         clips=clips,
         lenses={name: cameras[name].lens for name in clips if not cameras[name].lens.is_identity},
         sizes=sizes,
@@ -85,10 +89,13 @@ def assembled_rig(
 
 
 def opencv_lens(values: Sequence[float], fisheye: bool, where: str) -> Lens:
-    """Return the lens of OpenCV's coefficients: k1, k2, p1, p2, k3, k4, k5, k6, or k1 to k4 of a fisheye."""
+    """Return the lens of OpenCV's coefficients: k1, k2, p1, p2, k3, k4, k5, k6, or k1 to k4 of a fisheye.
+
+    Of 12 or 14, those behind the eighth must be zero; zeros alone are no lens, however many there are.
+    """
     if fisheye and len(values) == 4:
         return Lens("fisheye", tuple(values))
-    if fisheye or any(values[8:]) or len(values) in (1, 2, 3):
+    if fisheye or (any(values) and (len(values) not in (4, 5, 8, 12, 14) or any(values[8:]))):
         kind = "4 coefficients of a fisheye" if fisheye else "0, 4, 5 or 8 coefficients (k1, k2, p1, p2, k3 to k6)"
         raise SourceError(f"{where}: expected {kind}, got {list(values)}")
     k1, k2, p1, p2, *more = (*values, 0.0, 0.0, 0.0, 0.0)[: max(4, len(values))]
@@ -98,18 +105,25 @@ def opencv_lens(values: Sequence[float], fisheye: bool, where: str) -> Lens:
 def matched(calibrated: Sequence[str], pictures: Sequence[str]) -> dict[str, str]:
     """Return name of pictures -> name in the calibration: equal, else alike but for signs, else of one number.
 
-    Raises SourceError when some pictures have no calibration.
+    Names are taken for equal or alike where two or more are; numbers, where they leave no camera or no pictures over.
+    Raises SourceError when no way fits.
     """
     rules: tuple[Callable[[str], str], ...] = (
         lambda name: name,
         lambda name: re.sub(r"[^a-z0-9]", "", name.lower().rsplit(".", 1)[0]),
         lambda name: str(int((re.findall(r"\d+", name) or ["-1"])[0])),
     )
+    most: dict[str, str] = {}
     for rule in rules:
         known = {rule(name): name for name in calibrated}
         found = {name: known[rule(name)] for name in pictures if rule(name) in known}
-        if len(known) == len(calibrated) and len(found) == len(pictures) == len(set(found.values())):
-            return found
+        if len(known) < len(calibrated) or len(set(found.values())) < len(found) or len(found) < 2:
+            continue
+        whole = len(found) in (len(calibrated), len(pictures))
+        if len(found) > len(most) and (whole or rule is not rules[-1]):
+            most = found
+    if most:
+        return most
     raise SourceError(
         f"the cameras of the calibration ({', '.join(calibrated)}) do not fit the pictures ({', '.join(pictures)}): "
         "name videos or folders of pictures as the calibration names its cameras"

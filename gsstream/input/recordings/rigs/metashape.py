@@ -14,31 +14,44 @@ import numpy as np
 
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
+from gsstream.input.recordings.foreign import Keys, check_keys, parsed, pixels
 from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.poses import invert
 from gsstream.input.recordings.rigs.camera import RigCamera
 
 SUFFIXES = (".xml",)
-Optics = tuple[FloatArray, Lens, tuple[int, int]]
+Optics = tuple[FloatArray, Lens, tuple[int, int] | None]
+#: Elements of a calibration.
+_KEYS = Keys(
+    read=("resolution", "f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "b1", "b2"),
+    idle=("covariance", "date", "params", "meta"),
+    refused=("p3", "p4", "fx", "fy", "skew", "rolling_shutter"),
+)
 
 
 def read(path: Path, text: str) -> list[RigCamera]:
-    """Return the placed cameras of a file; none when it is of another format."""
+    """Return the cameras of a file; none when it is of another format."""
     if "<document" not in text or "<sensors" not in text:
         return []
     try:
         root = ElementTree.fromstring(text)
         sensors = {entry.attrib["id"]: entry for entry in root.iter("sensor")}
-        placed = [entry for entry in root.iter("camera") if entry.findtext("transform")]
-        return [_camera(entry, _optics(path, sensors[entry.attrib["sensor_id"]])) for entry in placed]
+        optics = {
+            name: _optics(path, entry) for name, entry in sensors.items() if entry.find("calibration") is not None
+        }
+        return [_camera(path, entry, optics) for entry in root.iter("camera") if "label" in entry.attrib]
     except (ElementTree.ParseError, KeyError, ValueError) as error:
         raise SourceError(f"{path}: not cameras of Metashape: {error!r}") from error
 
 
-def _camera(entry: ElementTree.Element, optics: Optics) -> RigCamera:
-    K, lens, size = optics
-    pose = np.array([float(word) for word in (entry.findtext("transform") or "").split()]).reshape(4, 4)
-    return RigCamera(name=Path(entry.attrib["label"]).stem, w2c=invert(pose), K=K, lens=lens, size=size)
+def _camera(path: Path, entry: ElementTree.Element, optics: dict[str, Optics]) -> RigCamera:
+    """A camera; one that was not aligned, or whose sensor was not calibrated, has no pose."""
+    label, sensor, transform = entry.attrib["label"], entry.attrib["sensor_id"], entry.findtext("transform")
+    K, lens, size = optics.get(sensor, (np.eye(3), Lens("radial", ()), None))
+    w2c = None
+    if transform and sensor in optics:
+        w2c = invert(parsed(f"{path}: camera {label!r}", "transform", transform.split(), 16).reshape(4, 4))
+    return RigCamera(name=Path(label).stem, w2c=w2c, K=K, lens=lens, size=size)
 
 
 def _optics(path: Path, sensor: ElementTree.Element) -> Optics:
@@ -50,11 +63,12 @@ def _optics(path: Path, sensor: ElementTree.Element) -> Optics:
         raise SourceError(f"{where}: expected type 'frame', a resolution and a calibration")
 
     def number(key: str) -> float:
-        return float(calibration.findtext(key) or 0)
+        return float(parsed(where, key, [calibration.findtext(key) or 0], 1)[0])
 
+    check_keys(where, [{part.tag: part.text for part in calibration}], _KEYS)
     if number("k4") or number("b2"):
         raise SourceError(f"{where}: k4 and b2 (skew) are not supported: optimise the cameras without them")
-    width, height = int(resolution.attrib["width"]), int(resolution.attrib["height"])
+    width, height = (pixels(where, key, int(resolution.attrib[key])) for key in ("width", "height"))
     f, cx, cy = number("f"), width / 2 + number("cx"), height / 2 + number("cy")
     K = np.array([[f + number("b1"), 0, cx], [0, f, cy], [0, 0, 1.0]])
     lens = Lens("radial", (number("k1"), number("k2"), number("k3")), (number("p2"), number("p1")))

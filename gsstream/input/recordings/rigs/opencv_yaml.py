@@ -17,50 +17,65 @@ from ruamel.yaml.nodes import MappingNode, ScalarNode, SequenceNode
 
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
+from gsstream.input.recordings.foreign import Keys, check_keys, parsed, pixels
 from gsstream.input.recordings.poses import from_pixel_centers, from_rotation_vector
 from gsstream.input.recordings.rigs.camera import RigCamera, opencv_lens
 
 SUFFIXES = (".yml", ".yaml")
 
 
+#: As OpenCV's samples, MC-Calib's and ROS's tools write it.
+_KEYS = Keys(
+    read=("camera_matrix", "K", "R", "rvec", "Rot", "T", "tvec", "distortion_coefficients", "distortion", "D", "dist",
+          "image_width", "image_height", "model", "distortion_model"),
+    idle=("calibration_time", "nframes", "nr_of_frames", "board_width", "board_height", "square_size", "flags",
+          "image_list", "image_points", "grid_points", "extrinsic_parameters", "avg_reprojection_error", "per_view_*",
+          "camera_name", "F", "P", "rectification_matrix", "projection_matrix", "aspectRatio", "names"),
+    refused=("xi", "skew", "distortion_type", "camera_group", "lens_model"),
+)  # fmt: skip
+_FISHEYE, _BROWN = (
+    ("fisheye", "equidistant", "opencv_fisheye"),
+    ("", "plumb_bob", "rational_polynomial", "pinhole", "opencv"),
+)
+
+
 def read(path: Path, text: str) -> list[RigCamera]:
     """Return the camera of a file; none when it holds something else."""
     if "!!opencv-matrix" not in text or not ("camera_matrix" in text or "\nK:" in text):
         return []
-    data = load_storage(path)
-    K = _numbers(path, data, ("camera_matrix", "K"))
-    rotation, translation = _numbers(path, data, ("R", "rvec", "Rot")), _numbers(path, data, ("T", "tvec"))
-    if len(K) != 9 or len(rotation) not in (3, 9) or len(translation) != 3:
-        got = f"{len(K)}, {len(rotation)}, {len(translation)}"
-        raise SourceError(f"{path}: expected 9 numbers of K, 3 or 9 of R, 3 of T, got {got}; calibrate the rig, too")
-    w2c = np.eye(4)
-    w2c[:3, :3] = from_rotation_vector(rotation) if len(rotation) == 3 else rotation.reshape(3, 3)
-    w2c[:3, 3] = translation
-    coefficients = _numbers(path, data, ("distortion_coefficients", "distortion", "D", "dist"))
-    fisheye = "fisheye" in str(data.get("model", "")).lower()
-    lens = opencv_lens(coefficients.tolist(), fisheye, str(path))
+    data, where = load_storage(path), str(path)
+    check_keys(where, [data], _KEYS)
+    rotation, translation = (
+        _numbers(where, data, "R", "rvec", "Rot", counts=(3, 9)),
+        _numbers(where, data, "T", "tvec", counts=(3,)),
+    )
+    w2c = None
+    if len(rotation) and len(translation):
+        w2c = np.eye(4)
+        w2c[:3, :3] = from_rotation_vector(rotation) if len(rotation) == 3 else rotation.reshape(3, 3)
+        w2c[:3, 3] = translation
+    coefficients = _numbers(where, data, "distortion_coefficients", "distortion", "D", "dist")
+    model = str(data.get("model", data.get("distortion_model", ""))).lower()
+    if model not in (*_FISHEYE, *_BROWN):
+        raise SourceError(
+            f"{path}: the model {model!r} is not supported; expected one of {', '.join((*_BROWN[1:], *_FISHEYE))}"
+        )
+    lens = opencv_lens(coefficients.tolist(), model in _FISHEYE, where)
     sides = [str(data.get(key, "")) for key in ("image_width", "image_height")]
     if not all(side.isdigit() for side in sides):
         raise SourceError(f"{path}: expected image_width and image_height in pixels, got {sides}")
-    return [
-        RigCamera(
-            name=path.stem,
-            w2c=w2c,
-            K=from_pixel_centers(K.reshape(3, 3)),
-            lens=lens,
-            size=(int(sides[0]), int(sides[1])),
-        )
-    ]
+    size = pixels(where, "image_width", int(sides[0])), pixels(where, "image_height", int(sides[1]))
+    K = _numbers(where, data, "camera_matrix", "K", counts=(9,)).reshape(3, 3)
+    return [RigCamera(name=path.stem, w2c=w2c, K=from_pixel_centers(K), lens=lens, size=size)]
 
 
-def _numbers(path: Path, data: dict[str, Any], keys: tuple[str, ...]) -> FloatArray:
+def _numbers(where: str, data: dict[str, Any], *keys: str, counts: tuple[int, ...] = ()) -> FloatArray:
     """The matrix under the first of some keys that is there, flat; empty where none is."""
-    entry: Any = next((data[key] for key in keys if key in data), {})
-    values = entry.get("data", ()) if isinstance(entry, dict) else entry
-    try:
-        return np.array([float(value) for value in values], np.float64)
-    except (TypeError, ValueError) as error:
-        raise SourceError(f"{path}: {' or '.join(keys)} holds something that is not a number ({error})") from error
+    key = next((key for key in keys if key in data), None)
+    if key is None:
+        return np.zeros(0)
+    values = data[key].get("data", ()) if isinstance(data[key], dict) else data[key]
+    return parsed(where, key, values if isinstance(values, list) else [values], *counts)
 
 
 def load_storage(path: Path) -> dict[str, Any]:

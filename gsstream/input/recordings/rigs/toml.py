@@ -15,10 +15,19 @@ from typing import Any
 import numpy as np
 
 from gsstream.core.errors import SourceError
+from gsstream.input.recordings.foreign import Keys, check_keys, matrix, number, pixels
 from gsstream.input.recordings.poses import from_pixel_centers, from_rotation_vector
 from gsstream.input.recordings.rigs.camera import RigCamera, opencv_lens
 
 SUFFIXES = (".toml",)
+#: Of a camera, as Anipose, Pose2Sim and Caliscope write it.
+_KEYS = Keys(
+    read=(
+        "name", "cam_id", "port", "ignore", "size", "matrix", "distortions", "fisheye", "rotation", "translation",
+    ),
+    idle=("rotation_count", "exposure", "error", "grid_count", "verified_resolutions"),
+    refused=("extra_distortions", "skew", "distortion_model", "model", "convention"),
+)  # fmt: skip
 
 
 def read(path: Path, text: str) -> list[RigCamera]:
@@ -28,28 +37,40 @@ def read(path: Path, text: str) -> list[RigCamera]:
     except tomllib.TOMLDecodeError as error:
         raise SourceError(f"{path}: not valid TOML: {error}") from error
     tables = {**data, **(data["cameras"] if isinstance(data.get("cameras"), dict) else {})}
-    return [
-        _camera(f"{path}: {key}", key, table)
+    rig = {
+        key: table
         for key, table in tables.items()
         if isinstance(table, dict) and {"matrix", "size"} <= set(table) and not table.get("ignore", False)
-    ]
+    }
+    if rig:
+        check_keys(str(path), rig.values(), _KEYS)
+    return [_camera(f"{path}: {key}", key, table) for key, table in rig.items()]
 
 
 def _camera(where: str, key: str, table: dict[str, Any]) -> RigCamera:
-    number = table.get("cam_id", table.get("port"))
-    name = str(table.get("name", key if number is None else f"cam_{number}"))
-    try:
-        matrix, size = np.array(table["matrix"], np.float64), tuple(int(side) for side in table["size"])
-        rotation, translation = (np.array(table[key], np.float64) for key in ("rotation", "translation"))
-        coefficients = [float(value) for value in table.get("distortions", ())]
+    numbered = table.get("cam_id", table.get("port"))
+    name = str(table.get("name", key if numbered is None else f"cam_{numbered}"))
+    size = table["size"]
+    if not isinstance(size, list) or len(size) != 2:
+        raise SourceError(f"{where}: size must be width and height, got {size!r:.60}")
+    # Caliscope writes the text "null" for what is not known.
+    coefficients = table.get("distortions", ())
+    if not isinstance(coefficients, list | tuple):
+        raise SourceError(f"{where}: distortions must be a list of numbers, got {coefficients!r:.60}")
+    fisheye = table.get("fisheye", False)
+    if not isinstance(fisheye, bool):
+        raise SourceError(f"{where}: fisheye must be true or false, got {fisheye!r:.60}")
+    values = [number(where, "distortions: every element", value) for value in coefficients]
+    w2c = None
+    if all(table.get(key, "null") != "null" for key in ("rotation", "translation")):
+        rotation = matrix(where, "rotation", table["rotation"], (3,), (3, 3))
         w2c = np.eye(4)
         w2c[:3, :3] = from_rotation_vector(rotation) if rotation.shape == (3,) else rotation
-        w2c[:3, 3] = translation
-    except KeyError as error:
-        raise SourceError(f"{where}: no {error}: only its lens is calibrated; calibrate the rig, too") from error
-    except (TypeError, ValueError) as error:
-        raise SourceError(f"{where}: expected numbers in matrix, size, rotation and translation ({error})") from error
-    if matrix.shape != (3, 3) or len(size) != 2:
-        raise SourceError(f"{where}: expected matrix 3 x 3 and size (width, height), got {list(matrix.shape)}, {size}")
-    lens = opencv_lens(coefficients, bool(table.get("fisheye", False)), where)
-    return RigCamera(name=name, w2c=w2c, K=from_pixel_centers(matrix), lens=lens, size=(size[0], size[1]))
+        w2c[:3, 3] = matrix(where, "translation", table["translation"], (3,))
+    return RigCamera(
+        name=name,
+        w2c=w2c,
+        K=from_pixel_centers(matrix(where, "matrix", table["matrix"], (3, 3))),
+        lens=opencv_lens(values, fisheye, where),
+        size=(pixels(where, "size", size[0]), pixels(where, "size", size[1])),
+    )

@@ -55,7 +55,6 @@ def files(name: str, kind: str) -> Mapping[str, str]:
     # The example is one that the contract kit is proven on; it is read as text, so that nothing heavy is imported.
     testing = Path(gsstream.__file__).parent / "testing"
     example = testing / "examples" / f"{kind}.py"
-    example = example if example.exists() else testing / kind / "example.py"
     part = example.read_text(encoding="utf-8").replace(f"Example{suffix}", cls)
     summary = part.splitlines()[0].strip('"')
     values = {"name": name, "kind": kind, "package": package, "cls": cls, "summary": summary, "module": kind}

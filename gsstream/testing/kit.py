@@ -21,11 +21,10 @@ from gsstream.testing.registry import CHECKS, MIN_REASON, Advice, Check, Skip, c
 
 Status = Literal["passed", "failed", "warning", "expected failure", "skipped"]
 #: Modules of checks: for parts of all kinds, for each kind, for packets, for commands. Importing them fills the
-#: registry, in the order of the reports. In a folder the checks are its module ``checks``.
+#: registry, in the order of the reports.
 MODULES = ("common", *PART_KINDS, "packet", "command")
 for _name in MODULES:
-    if hasattr(importlib.import_module(f"gsstream.testing.{_name}"), "__path__"):
-        importlib.import_module(f"gsstream.testing.{_name}.checks")
+    importlib.import_module(f"gsstream.testing.{_name}")
 
 
 @dataclass(frozen=True, slots=True)

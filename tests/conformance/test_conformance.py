@@ -97,8 +97,15 @@ def test_every_rule_has_a_stream_or_a_test_that_is_named() -> None:
 
 #: Rules that no stream can break: they say how a value comes about, or that something is played.
 PLAYED = [
-    "R-0.4-1", "R-0.5-1", "R-1.1-5", "R-1.6-1", "R-2.5-1", "R-3.2-9", "R-4.3-1", "R-4.4-6",
-]  # fmt: skip
+    "R-0.4-1",
+    "R-0.5-1",
+    "R-1.1-5",
+    "R-1.6-1",
+    "R-2.5-1",
+    "R-3.2-9",
+    "R-4.3-1",
+    "R-4.4-6",
+]
 
 
 def altered(case: Case) -> list[Outcome]:
@@ -172,9 +179,10 @@ def flushing(gaussians: Any, stored: Any, residual: Any) -> Any:
 
 MEANS, APPLY = motion._means, residual_change.apply_residual
 WRONG = {
-    "core.changes.residual.decode_residual": wide_residual, "core.changes.motion._means": backwards,
+    "core.changes.residual.decode_residual": wide_residual,
+    "core.changes.motion._means": backwards,
     "core.changes.delta.apply_residual": sparing,
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("place", "function"), [*WRONG.items(), ("core.changes.delta.apply_residual", flushing)])

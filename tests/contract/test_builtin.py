@@ -21,11 +21,11 @@ from gsstream.testing.examples.confidence import ExampleConfidence
 from gsstream.testing.examples.gate import ExampleGate
 from gsstream.testing.examples.propagation import ExamplePropagation
 from gsstream.testing.examples.regularizer import ExampleRegularizer
+from gsstream.testing.examples.source import ExampleSource
 from gsstream.testing.examples.streaming_method import ExampleMethod
 from gsstream.testing.examples.structure import ExampleStructure
 from gsstream.testing.examples.update import ExampleUpdate
 from gsstream.testing.kit import all_checks, summary
-from gsstream.testing.source.example import ExampleSource
 
 EXAMPLES = [ExampleStructure(), ExampleConfidence(), ExamplePropagation(), ExampleGate(), ExampleRegularizer()]
 EXAMPLES += [ExampleMethod(), ExampleUpdate()]

@@ -95,8 +95,11 @@ def test_space_presses_the_button_that_has_the_focus_and_escape_closes(site, tmp
     ]  # fmt: skip
     results = look(site, tmp_path, steps)
     assert [found for found in results if isinstance(found, list | bool)] == [
-        ["true", False, "more"], False, ["false", False, "more"], True,
-    ]  # fmt: skip
+        ["true", False, "more"],
+        False,
+        ["false", False, "more"],
+        True,
+    ]
 
 
 def test_arrows_turn_plus_and_minus_zoom_comma_and_period_step(site, tmp_path):
@@ -131,10 +134,14 @@ def test_a_screen_reader_is_told_names_and_states(site, tmp_path):
 def test_who_wants_no_motion_begins_it(site, tmp_path):
     media = {"features": [{"name": "prefers-reduced-motion", "value": "reduce"}]}
     steps = [
-        ["send", "Emulation.setEmulatedMedia", media], ["go", "URL/index.html?autoplay=1"], READY, ["pause", 500],
-        ["evaluate", f"[{PLAYER}.playing, {PLAYER}.frame]"], ["evaluate", f"{ROOT}.querySelector('.play').click()"],
+        ["send", "Emulation.setEmulatedMedia", media],
+        ["go", "URL/index.html?autoplay=1"],
+        READY,
+        ["pause", 500],
+        ["evaluate", f"[{PLAYER}.playing, {PLAYER}.frame]"],
+        ["evaluate", f"{ROOT}.querySelector('.play').click()"],
         ["until", f"{PLAYER}.frame > 0"],
-    ]  # fmt: skip
+    ]
     assert look(site, tmp_path, steps)[4] == [False, 0]
 
 
@@ -146,10 +153,13 @@ def test_attributes_may_change_and_what_is_not_there_is_said(site, tmp_path):
     second = """document.body.append(document.createElement('gsstream-player'));
       document.querySelectorAll('gsstream-player')[1].shadowRoot.querySelector('.message').textContent"""
     steps = [
-        ["go", "URL/index.html?camera=nosuch"], READY, ["until", f"{PLAYER}.drew"], ["evaluate", MESSAGE],
+        ["go", "URL/index.html?camera=nosuch"],
+        READY,
+        ["until", f"{PLAYER}.drew"],
+        ["evaluate", MESSAGE],
         ["evaluate", f"{change}[{PLAYER}.view.id, {PLAYER}.speed, {PLAYER}.loop]"],
         ["evaluate", second],
-    ]  # fmt: skip
+    ]
     results = look(site, tmp_path, steps)
     assert '"nosuch"' in results[3]
     assert "held-out" in results[3]
@@ -192,10 +202,13 @@ def test_messages_name_the_cause_and_what_to_do(site, tmp_path, name):
 def test_offline_is_said(site, tmp_path):
     offline = {"offline": True, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
     steps = [
-        WITHOUT_WORKERS, ["go", "URL/index.html"], READY, ["send", "Network.emulateNetworkConditions", offline],
+        WITHOUT_WORKERS,
+        ["go", "URL/index.html"],
+        READY,
+        ["send", "Network.emulateNetworkConditions", offline],
         ["evaluate", f"{PLAYER}.open('other.gss').catch(() => {{}})"],
         ["until", f"{MESSAGE}.includes('offline')"],
-    ]  # fmt: skip
+    ]
     with serving(site) as (url, _):
         try_in_browser(at(url, steps), tmp_path)
 

@@ -59,9 +59,14 @@ def test_the_newest_of_many_seeks_wins(site, tmp_path):
     seeks = "; ".join(f"{PLAYER}.seek({frame})" for frame in (11, 3, 0, 7, 2, 10, 5))
     shown = f"window.shown = []; {PLAYER}.addEventListener('frame', () => shown.push({PLAYER}.frame)); {seeks}"
     steps = [
-        ["go", "URL/index.html"], READY, ["evaluate", shown], ["until", f"{PLAYER}._target === null"],
-        ["evaluate", f"[{PLAYER}.frame, shown]"], ["picture", 5, 32, 24], ["picture", 6, 32, 24],
-    ]  # fmt: skip
+        ["go", "URL/index.html"],
+        READY,
+        ["evaluate", shown],
+        ["until", f"{PLAYER}._target === null"],
+        ["evaluate", f"[{PLAYER}.frame, shown]"],
+        ["picture", 5, 32, 24],
+        ["picture", 6, 32, 24],
+    ]
     with serving(site) as (url, _), Playback(site / "stream.gss") as playback:
         *_, (frame, seen), five, six = in_browser(at(url, steps), tmp_path, size=(120, 90))
         assert (frame, seen[-1]) == (5, 5)

@@ -36,9 +36,12 @@ window.device = device;
 await import("./element.js");
 </script><gsstream-player src="stream.json" style="width: 400px"></gsstream-player>"""
 ENTER = [
-    ["go", "URL/headset.html"], ["until", f"{PLAYER}?.drew"], ["until", f"!{ROOT}.querySelector('.headset').hidden"],
-    ["evaluate", f"{ROOT}.querySelector('.headset').click()"], ["until", f"{HEADSET}?.pictures > 3"],
-]  # fmt: skip
+    ["go", "URL/headset.html"],
+    ["until", f"{PLAYER}?.drew"],
+    ["until", f"!{ROOT}.querySelector('.headset').hidden"],
+    ["evaluate", f"{ROOT}.querySelector('.headset').click()"],
+    ["until", f"{HEADSET}?.pictures > 3"],
+]
 #: Both eyes as they are in the headset, then each by the ordinary way of the player at the size of its window.
 EYES = f"""(async () => {{
   const headset = {HEADSET}, {{ renderer }} = {PLAYER}, {{ gl }} = renderer;
@@ -150,9 +153,12 @@ def test_a_stream_plays_and_seeks_for_120_pictures_and_the_page_comes_back(room,
 def test_a_lost_context_ends_the_session_and_the_page_goes_on(room, tmp_path):
     steps = [
         ["evaluate", f"window.loss = {PLAYER}.renderer.gl.getExtension('WEBGL_lose_context'), loss.loseContext()"],
-        ["until", f"!{HEADSET}.session"], ["evaluate", "loss.restoreContext()"], ["pause", 500],
-        ["picture", 3, 32, 24], ["evaluate", MESSAGE],
-    ]  # fmt: skip
+        ["until", f"!{HEADSET}.session"],
+        ["evaluate", "loss.restoreContext()"],
+        ["pause", 500],
+        ["picture", 3, 32, 24],
+        ["evaluate", MESSAGE],
+    ]
     with serving(room) as (url, _):
         results, messages = try_in_browser(at(url, [*ENTER, *steps]), tmp_path)
     assert all("iwer.module.js" in text for text in messages), "the emulator itself reads from a lost context"
@@ -187,12 +193,21 @@ def test_without_a_device_there_is_no_button_and_without_https_a_sentence(site, 
     hidden = f"{ROOT}.querySelector('.headset').hidden"
     with serving(site) as (url, _):
         steps = [
-            ["go", f"{url}/index.html?xr=vr"], ["until", f"{PLAYER}?.drew"], ["pause", 300], ["evaluate", hidden],
-            ["go", f"{url.replace('127.0.0.1', 'other.test')}/index.html?xr=vr"], ["until", f"{PLAYER}?.drew"],
-            ["until", f"!{hidden}"], ["evaluate", f"{ROOT}.querySelector('.headset').click()"],
-            ["until", MESSAGE], ["evaluate", MESSAGE], ["go", f"{url.replace('127.0.0.1', 'other.test')}/index.html"],
-            ["until", f"{PLAYER}?.drew"], ["pause", 300], ["evaluate", hidden],
-        ]  # fmt: skip
+            ["go", f"{url}/index.html?xr=vr"],
+            ["until", f"{PLAYER}?.drew"],
+            ["pause", 300],
+            ["evaluate", hidden],
+            ["go", f"{url.replace('127.0.0.1', 'other.test')}/index.html?xr=vr"],
+            ["until", f"{PLAYER}?.drew"],
+            ["until", f"!{hidden}"],
+            ["evaluate", f"{ROOT}.querySelector('.headset').click()"],
+            ["until", MESSAGE],
+            ["evaluate", MESSAGE],
+            ["go", f"{url.replace('127.0.0.1', 'other.test')}/index.html"],
+            ["until", f"{PLAYER}?.drew"],
+            ["pause", 300],
+            ["evaluate", hidden],
+        ]
         results = in_browser(steps, tmp_path, flags=["--host-resolver-rules=MAP other.test 127.0.0.1"])
     assert results[3] is True
     assert "https" in results[9]

@@ -12,8 +12,8 @@ import numpy as np
 
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.storage import to_bytes
+from gsstream.testing.examples.source import ExampleSource
 from gsstream.testing.recording import SourceUnderTest
-from gsstream.testing.source.example import ExampleSource
 from saboteurs.register import spoils
 
 

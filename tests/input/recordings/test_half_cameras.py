@@ -47,7 +47,7 @@ HALVES: dict[str, tuple[str, Callable[[Path], Any], str]] = {
     "easymocap without K": ("enerf", in_text("intri.yml", "K_02", "ccm_02"), r"without one of K.*: 02; 3 of 4 stay"),
     "easymocap without T": ("enerf", in_text("extri.yml", "T_02", "t_02"), r"without one of K.*: 02; 3 of 4 stay"),
     "easymocap without a name": ("enerf", lambda f: shutil.copytree(f / "images/01", f / "images/77"), "77; 4 of 5"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", HALVES)
@@ -83,7 +83,7 @@ RIGS: dict[str, tuple[str, Callable[[str], str], str]] = {
         lambda t: t.replace('active="1" serial="cam_2"', 'active="0" serial="cam_2"'),
         "without a calibration .*: cam_2; 2 of 3 stay",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", RIGS)

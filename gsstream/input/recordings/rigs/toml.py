@@ -23,11 +23,20 @@ SUFFIXES = (".toml",)
 #: Of a camera, as Anipose, Pose2Sim and Caliscope write it.
 _KEYS = Keys(
     read=(
-        "name", "cam_id", "port", "ignore", "size", "matrix", "distortions", "fisheye", "rotation", "translation",
+        "name",
+        "cam_id",
+        "port",
+        "ignore",
+        "size",
+        "matrix",
+        "distortions",
+        "fisheye",
+        "rotation",
+        "translation",
     ),
     idle=("rotation_count", "exposure", "error", "grid_count", "verified_resolutions"),
     refused=("extra_distortions", "skew", "distortion_model", "model", "convention"),
-)  # fmt: skip
+)
 
 
 def read(path: Path, text: str) -> list[RigCamera]:

@@ -18,6 +18,8 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _RGB_COLOR_TYPE = b"\x02"
 #: The only decoders that Pillow may try: others are many, some start programs (EPS: Ghostscript), none is documented.
 PICTURE_FORMATS = ("PNG", "JPEG")
+#: What Pillow raises for damaged files; ValueError: texts and profiles that unpack to more than a megabyte.
+UNDECODABLE = (OSError, SyntaxError, ValueError, EOFError, zlib.error, Image.DecompressionBombError)
 #: The EXIF tag that says how viewers turn a picture, and its value for "not at all".
 _ORIENTATION, _UPRIGHT = 0x0112, 1
 _READABLE = "8-bit JPEG or PNG, or 16-bit PNG, without transparency"
@@ -43,13 +45,7 @@ def read_stored(
     path: Path, size: tuple[int, int], target: tuple[int, int], declared: str = "cameras.json declares"
 ) -> Any:
     """Return what :func:`read_image` does as uint8, of which 255 is 1.0, where that holds it: 8 bits at their size."""
-    pixels, full_scale = _decode(path)
-    height, width = pixels.shape[:2]
-    if (width, height) != size:
-        raise SourceError(
-            f"{path}: the image is {width} x {height} pixels, but {declared} {size[0]} x {size[1]}; "
-            "correct the declared size (and K with it) or export the frames again"
-        )
+    pixels, full_scale = _decode(path, size, declared)
     if pixels.dtype == np.uint8 and target == size:
         return pixels
     return shrink(pixels, target) / np.float32(full_scale)
@@ -103,19 +99,25 @@ def _head(path: Path) -> bytes:
         return file.read(26)
 
 
-def _decode(path: Path) -> tuple[np.ndarray[Any, Any], float]:
-    """Pixels [H, W, 3] uint8 or uint16 and the value that means 1.0."""
+def _decode(path: Path, size: tuple[int, int], declared: str) -> tuple[np.ndarray[Any, Any], float]:
+    """Pixels [H, W, 3] uint8 or uint16 and the value that means 1.0; none are decoded of a picture of another size."""
     try:
-        if is_deep(path) and _head(path)[25:] == _RGB_COLOR_TYPE:
-            return _decode_rgb16(path), 65535.0
         with Image.open(path, formats=PICTURE_FORMATS) as image:
+            if image.size != size:
+                raise SourceError(
+                    f"{path}: the image is {image.width} x {image.height} pixels, but {declared} {size[0]} x {size[1]};"
+                    " correct the declared size (and K with it) or export the frames again"
+                )
+            if is_deep(path) and _head(path)[25:] == _RGB_COLOR_TYPE:
+                return _decode_rgb16(path), 65535.0
             image.load()
             _warn_if_rotated(image)
             return _to_rgb(path, image)
     except FileNotFoundError as error:
         raise SourceError(f"{path}: the image is missing; every declared frame must exist ({_READABLE})") from error
-    # Pillow raises SyntaxError, struct- and zlib-level errors for damaged PNG chunks besides OSError.
-    except (OSError, SyntaxError, EOFError, zlib.error, Image.DecompressionBombError) as error:
+    except SourceError:  # is a ValueError, too
+        raise
+    except UNDECODABLE as error:
         raise SourceError(
             f"{path}: the image cannot be decoded ({error}); expected {_READABLE}; {told_apart(path)}"
         ) from error
@@ -143,12 +145,18 @@ def _decode_rgb16(path: Path) -> np.ndarray[Any, Any]:
 
 
 def _to_rgb(path: Path, image: Image.Image) -> tuple[np.ndarray[Any, Any], float]:
-    transparent = image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
-    if transparent:
-        raise SourceError(
-            f"{path}: the image has a transparency channel (mode {image.mode}); expected {_READABLE}. "
-            "Flatten it over the background you want to train against"
+    if image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info:
+        if is_deep(path) or image.convert("RGBA").getchannel("A").getextrema() != (255, 255):
+            raise SourceError(
+                f"{path}: the image has a transparency channel (mode {image.mode}); expected {_READABLE}. "
+                "Flatten it over the background you want to train against"
+            )
+        warnings.warn(
+            "pictures of this recording have a transparency channel; as long as it is opaque everywhere, only the "
+            "colours are read",
+            stacklevel=2,
         )
+        return np.asarray(image.convert("RGBA"))[..., :3].copy(), 255.0
     if image.mode.startswith("I;16"):
         grey = np.asarray(image).astype(np.uint16)
         return np.repeat(grey[..., None], 3, axis=2), 65535.0

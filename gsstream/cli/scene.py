@@ -41,7 +41,12 @@ def prepare(
     each: Annotated[bool, typer.Option("--each", help="A lens per camera; else all cameras share one.")] = False,
     frames: Annotated[int | None, typer.Option("--frames", help="Frames to take over; all by default.")] = None,
     width: Annotated[int | None, typer.Option("--width", help="Shrink pictures to this width.")] = None,
-    fps: Annotated[float, typer.Option("--fps", help="Frames per second, where poses are not given.")] = 30.0,
+    fps: Annotated[
+        float | None, typer.Option("--fps", help="Frames per second, where RAW does not say; 30 by default.")
+    ] = None,
+    without: Annotated[
+        list[str] | None, typer.Option("--without", metavar="ID", help="Camera that is left out; repeatable.")
+    ] = None,
     quiet: options.Quiet = False,
 ) -> None:
     """Make a validated scene from raw synchronised recordings: poses, pinhole pictures, points, a report.
@@ -60,7 +65,13 @@ def prepare(
     began = time.perf_counter()
     model = lens.upper().replace("-", "_")
     options = PrepareOptions(
-        test=tuple(test) if test else None, model=model, each=each, frames=frames, width=width, fps=fps
+        test=tuple(test) if test else None,
+        without=tuple(without or ()),
+        model=model,
+        each=each,
+        frames=frames,
+        width=width,
+        fps=fps,
     )
     with working("reading pictures", quiet) as display:
         made = make(raw, out, options, say=lambda line: None if quiet else typer.echo(line), tell=display.tell)

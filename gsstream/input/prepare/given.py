@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gsstream.core.errors import SourceError
+from gsstream.core.errors import InputError, SourceError
 from gsstream.core.shapes import FloatArray
-from gsstream.input.prepare.raw import RawCamera, find_cameras
-from gsstream.input.recordings.clips import Clip, ImageClip
+from gsstream.input.prepare.raw import RawCamera, beside_each_other, find_cameras
 from gsstream.input.recordings.detect import LAYOUTS, detect, layouts_of
 from gsstream.input.recordings.layouts import declared
 from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.open import read_layout
 from gsstream.input.recordings.recorded import Recording, check_sizes
-from gsstream.input.recordings.sync import align
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,12 +27,36 @@ class GivenRig:
     Ks: FloatArray
     lenses: tuple[Lens, ...]
     test: tuple[str, ...]
-    fps: float
     licence: str
 
+    def without(self, left_out: Collection[int]) -> GivenRig:
+        """Return the calibration of the other cameras; ``left_out``: places in the rig."""
+        kept = [i for i in range(len(self.lenses)) if i not in left_out]
+        lenses = tuple(self.lenses[i] for i in kept)
+        return replace(self, viewmats=self.viewmats[kept], Ks=self.Ks[kept], lenses=lenses)
 
-def read_raw(source: str) -> tuple[str, list[RawCamera], GivenRig | None]:
-    """Return name, cameras and calibration, if any, of a recording that a run reads, or of pictures or videos.
+
+@dataclass(frozen=True, slots=True)
+class RawRecording:
+    """What there is to prepare; ``fps``: frames per second as its calibration or its videos have it, if any."""
+
+    title: str
+    cameras: list[RawCamera]
+    known: GivenRig | None
+    fps: float | None
+
+    def without(self, names: Collection[str]) -> RawRecording:
+        """Return the recording without these cameras. Raises InputError for an unknown one."""
+        there = [camera.name for camera in self.cameras]
+        if unknown := sorted(set(names).difference(there)):
+            raise InputError(f"--without: no camera {unknown[0]!r}; cameras: {', '.join(there)}")
+        left_out = [i for i, name in enumerate(there) if name in names]
+        cameras = [camera for camera in self.cameras if camera.name not in names]
+        return replace(self, cameras=cameras, known=self.known and self.known.without(left_out))
+
+
+def read_raw(source: str) -> RawRecording:
+    """Read a recording that a run reads, or pictures or videos without a calibration.
 
     Raises SourceError for anything else.
     """
@@ -43,32 +66,17 @@ def read_raw(source: str) -> tuple[str, list[RawCamera], GivenRig | None]:
     if folder.is_dir() and named is None:
         named = detect(folder) if layouts_of(folder) else None
     if named is None:
-        return folder.resolve().name, find_cameras(folder), None
+        cameras, fps = find_cameras(folder)
+        return RawRecording(folder.resolve().name, cameras, None, fps)
     recording = declared.read(folder, any_sizes=True) if named == "folder" else read_layout(named, folder)
-    return folder.resolve().name, *_taken(recording)
+    return _taken(folder.resolve().name, recording)
 
 
-def _taken(recording: Recording) -> tuple[list[RawCamera], GivenRig]:
+def _taken(title: str, recording: Recording) -> RawRecording:
     check_sizes(recording)
-    rig, beside = recording.rig, align(recording.name, recording.clips)
-    cameras = [
-        _camera(name, clip, range(beside.skip[name], beside.skip[name] + beside.num_frames))
-        for name, clip in recording.clips.items()
-    ]
+    rig, (cameras, fps) = recording.rig, beside_each_other(recording.name, recording.clips)
     if len(cameras) < 2:
         raise SourceError(f"{recording.where}: cameras found: {len(cameras)}; expected at least two")
     lenses = tuple(recording.lenses.get(name, Lens("radial", ())) for name in rig.ids)
-    fps = beside.fps or recording.fps
-    return cameras, GivenRig(
-        viewmats=rig.viewmats, Ks=rig.Ks, lenses=lenses, test=recording.test, fps=fps, licence=recording.licence
-    )
-
-
-def _camera(name: str, clip: Clip, span: range) -> RawCamera:
-    """Pictures stay files, which a scene may hold as they are."""
-    files = clip.files[span.start : span.stop] if isinstance(clip, ImageClip) else ()
-    return (
-        RawCamera(name, files, clip.size)
-        if files
-        else RawCamera(name=name, files=(), size=clip.size, clip=clip, span=span)
-    )
+    known = GivenRig(rig.viewmats, rig.Ks, lenses, recording.test, licence=recording.licence)
+    return RawRecording(title, cameras, known, fps or recording.fps)

@@ -24,7 +24,7 @@ from gsstream.core.progress import Tell, silent
 from gsstream.core.shapes import FloatArray
 from gsstream.core.storage import to_bytes
 from gsstream.input.prepare.given import GivenRig, read_raw
-from gsstream.input.prepare.raw import RawCamera, first_frames
+from gsstream.input.prepare.raw import RawCamera, changes_of, first_frames
 from gsstream.input.recordings.calibration import CALIBRATION_FILE, SCHEMA
 from gsstream.input.recordings.lens import Lens, Undistortion, undistortion
 from gsstream.input.seeds.mapping import Mapping, reconstruct, triangulate
@@ -41,6 +41,7 @@ class PrepareOptions:
     """How a scene is made."""
 
     test: tuple[str, ...] | None = None  # ids of test cameras; None: those of a given calibration
+    without: tuple[str, ...] = ()  # ids of cameras that are left out
     model: str = "SIMPLE_RADIAL"  # lens model of structure from motion (a key of ``seeds.mapping.LENSES``)
     each: bool = False  # every camera has a lens of its own; else all share one where all pictures have one size
     frames: int | None = None  # at most so many frames; None: all
@@ -49,7 +50,7 @@ class PrepareOptions:
     width: int | None = None
     max_points: int = 50_000  # points kept
     max_error: float = 2.0  # points with a larger mean reprojection error are dropped, pixels
-    fps: float = 30.0  # frames per second of the recording, when it is not given elsewhere
+    fps: float | None = None  # frames per second, where neither a calibration nor videos say; None: 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,13 +76,17 @@ def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say, tell:
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise OutputError(f"{out} exists and is not an empty folder; choose another --out")
-    title, cameras, known = read_raw(str(raw))
+    found = read_raw(str(raw)).without(options.without)
+    cameras, known = found.cameras, found.known
     names = tuple(camera.name for camera in cameras)
     test = options.test if options.test is not None else known.test if known else ()
+    test = tuple(name for name in test if name not in options.without)
     for name in test:
         if name not in names:
             raise InputError(f"--test: no camera {name!r}; cameras: {', '.join(names)}")
     say(f"{len(cameras)} cameras, {len(test)} of them for testing only; {'known' if known else 'unknown'} poses")
+    if options.fps and found.fps and abs(options.fps - found.fps) > 0.01:
+        say(f"warning: the recording has {found.fps:g} frames per second; --fps {options.fps:g} is not used")
     say("reading frame 0")
     images = first_frames(cameras)
     say(f"matching features of {len(cameras)} pictures; minutes for tens of cameras")
@@ -95,19 +100,16 @@ def prepare(raw: Path | str, out: Path, options: PrepareOptions, say: Say, tell:
     say(f"placed {len(kept)} of {len(names)} cameras, {len(mapping.xyz)} points")
     target = _target([cameras[i] for i in kept], options)
     lenses = _pinholes([cameras[i] for i in kept], mapping.Ks[kept], [mapping.lenses[i] for i in kept], target)
+    for line in changes_of([cameras[i] for i in kept], [lens is not None for _, lens in lenses], target):
+        say(line)
     rig = Cameras(tuple(names[i] for i in kept), mapping.viewmats[kept], np.stack([K for K, _ in lenses]), *target)
-    found = _points(mapping, rig, options)
-    points, bounds = found if found else (None, None)
-    say(f"kept {len(found[0]) if found else 'no'} points; writing pictures")
-    counts = _write_pictures([cameras[i] for i in kept], [lens for _, lens in lenses], out, options=options, tell=tell)
-    frames = min(counts)
-    if frames < max(counts):
-        told = ", ".join(f"{name} {count}" for name, count in zip(rig.ids, counts, strict=True))
-        say(f"warning: cameras differ in their frames ({told}); the first {frames} are used")
-    fps = known.fps if known else options.fps
-    _write(
-        out, title, rig, test=test, found=found, frames=frames, fps=fps, licence="" if known is None else known.licence
-    )
+    cloud = _points(mapping, rig, options)
+    points, bounds = cloud if cloud else (None, None)
+    say(f"kept {len(cloud[0]) if cloud else 'no'} points; writing pictures")
+    _write_pictures([cameras[i] for i in kept], [lens for _, lens in lenses], out, options=options, tell=tell)
+    frames = len(cameras[0].span[: options.frames])
+    fps, licence = found.fps or options.fps or 30.0, "" if known is None else known.licence
+    _write(out, found.title, rig, test=test, found=cloud, frames=frames, fps=fps, licence=licence)
     left_out = tuple(name for i, name in enumerate(names) if i not in kept)
     return Prepared(
         names=names,
@@ -211,25 +213,19 @@ def _points(mapping: Mapping, rig: Cameras, options: PrepareOptions) -> tuple[Po
 
 def _write_pictures(
     cameras: list[RawCamera], lenses: list[Undistortion | None], out: Path, options: PrepareOptions, tell: Tell
-) -> list[int]:
-    """Pictures of all cameras; the number of frames of each."""
-    counts = []
+) -> None:
     for number, (camera, lens) in enumerate(zip(cameras, lenses, strict=True)):
         tell("writing pictures: cameras", number, len(cameras))
         folder = child(out, camera.name)
         folder.mkdir(parents=True)
-        if lens is None and camera.copied:
-            chosen = camera.files[: options.frames]
-            for t, path in enumerate(chosen):
+        # Pictures that are copied are read, too: a damaged one is an error here and no surprise later.
+        for t, image in enumerate(camera.frames(options.frames)):
+            if lens is None and camera.files:
+                path = camera.files[t]
                 shutil.copyfile(path, folder / f"{t:06d}{path.suffix.lower()}")
-            counts.append(len(chosen))
-            continue
-        count = 0
-        for count, image in enumerate(camera.frames(options.frames), start=1):
+                continue
             shown = image if lens is None else lens.apply(image)
-            Image.fromarray(to_bytes(shown)).save(folder / f"{count - 1:06d}.png", compress_level=3)
-        counts.append(count)
-    return counts
+            Image.fromarray(to_bytes(shown)).save(folder / f"{t:06d}.png", compress_level=3)
 
 
 def _write(

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from gsstream.core.errors import SourceError
 from gsstream.input.recordings.base import FilesMissing
-from gsstream.input.recordings.images import PICTURE_FORMATS, is_deep, read_stored, told_apart
+from gsstream.input.recordings.images import PICTURE_FORMATS, UNDECODABLE, is_deep, read_stored, told_apart
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".ts")
 
 
 class Clip(Protocol):
@@ -33,8 +34,8 @@ class Clip(Protocol):
     def num_frames(self) -> int: ...
 
     @property
-    def first(self) -> int:
-        """Number of the first picture, where files are numbered; else 0."""
+    def numbers(self) -> Sequence[int]:
+        """Numbers of the pictures, ascending, where files are numbered; else counted from 0."""
 
     @property
     def deep(self) -> bool:
@@ -51,13 +52,14 @@ class Clip(Protocol):
 
 
 class ImageClip:
-    """Image files in the given order, 8 or 16 bit, the first of which has the number ``first``.
+    """Image files in the given order, 8 or 16 bit, with these ascending ``numbers``; None: counted from 0.
 
     Raises SourceError when a file is missing or the first one is not an image.
     """
 
-    def __init__(self, files: Sequence[Path], first: int = 0) -> None:
-        self._files, self._first = tuple(files), first
+    def __init__(self, files: Sequence[Path], numbers: Sequence[int] | None = None) -> None:
+        self._files = tuple(files)
+        self._numbers = range(len(self._files)) if numbers is None else tuple(numbers)
         if missing := [path for path in files if not path.is_file()]:
             raise FilesMissing(
                 f"{missing[0]}: the picture is missing ({len(missing)} of {len(files)} of this camera are); restore it"
@@ -82,8 +84,8 @@ class ImageClip:
         return len(self._files)
 
     @property
-    def first(self) -> int:
-        return self._first
+    def numbers(self) -> Sequence[int]:
+        return self._numbers
 
     @property
     def deep(self) -> bool:
@@ -101,7 +103,7 @@ def _opened(path: Path) -> tuple[tuple[int, int], bool]:
     try:
         with Image.open(path, formats=PICTURE_FORMATS) as image:
             return image.size, is_deep(path)
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+    except UNDECODABLE as error:
         raise SourceError(
             f"{path}: the image cannot be opened ({error}); expected PNG or JPEG; {told_apart(path)}"
         ) from error
@@ -119,36 +121,76 @@ def natural_sort_key(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name) if part]
 
 
-def images_in(folder: Path) -> list[Path]:
-    """Return the image files of a folder, in natural order; empty when there is no such folder."""
+def files_in(folder: Path, suffixes: Sequence[str]) -> list[Path]:
+    """Return the files of a folder with these suffixes, of any case, in natural order; empty without such a folder.
+
+    Hidden files are passed over: file managers leave some (``._NAME`` beside NAME) that are no pictures.
+    """
     if not folder.is_dir():
         return []
-    return sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=natural_sort_key)
+    shown = (path for path in folder.iterdir() if not path.name.startswith("."))
+    return sorted((path for path in shown if path.suffix.lower() in suffixes), key=natural_sort_key)
+
+
+def images_in(folder: Path) -> list[Path]:
+    """Return the image files of a folder, in natural order; empty when there is no such folder."""
+    return files_in(folder, IMAGE_SUFFIXES)
+
+
+def folders_in(folder: Path) -> list[Path]:
+    """Return the folders of a folder that are not hidden, in natural order; empty when there is no such folder."""
+    inside = folder.iterdir() if folder.is_dir() else ()
+    return sorted((p for p in inside if p.is_dir() and not p.name.startswith(".")), key=natural_sort_key)
+
+
+def clips_in(places: Sequence[Path]) -> dict[str, Clip]:
+    """Return camera -> clip of the first of these folders that holds two cameras or more; empty where none does.
+
+    Looked for in this order: a video per camera, a folder of pictures per camera, a picture per camera.
+    """
+    for place in places:
+        if len(videos := files_in(place, VIDEO_SUFFIXES)) > 1:
+            from gsstream.input.recordings.video import VideoClip
+
+            return {name: VideoClip(path) for name, path in _by_stem(videos).items()}
+    for place in places:
+        if len(cameras := [path for path in folders_in(place) if images_in(path)]) > 1:
+            return {path.name: folder_clip(path) for path in cameras}
+    for place in places:
+        if len(pictures := images_in(place)) > 1:
+            return {name: ImageClip([path]) for name, path in _by_stem(pictures).items()}
+    return {}
+
+
+def _by_stem(files: list[Path]) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for path in files:
+        if path.stem in found:
+            raise SourceError(f"{path} and {found[path.stem].name}: two files of one camera; leave one of them there")
+        found[path.stem] = path
+    return found
 
 
 def folder_clip(folder: Path) -> ImageClip:
     """Return all images of a folder as one camera's frames; the last number in a name is the frame number.
 
-    Raises SourceError for an empty folder, for gaps in the numbers and for two files of one number.
+    Raises SourceError for an empty folder, for a name without a number and for two files of one number.
     """
     files = images_in(folder)
     if not files:
         raise SourceError(f"{folder}: no images; expected frames as PNG or JPEG files")
     numbers = [_number(path) for path in files]
     if len(files) == 1:
-        return ImageClip(files, numbers[0] or 0)
+        return ImageClip(files, [numbers[0] or 0])
     known = [number for number in numbers if number is not None]
     if len(known) < len(files):
         odd = files[numbers.index(None)]
         raise SourceError(f"{odd}: expected a frame number at the end of the name, e.g. 000012.png")
-    for path, number, following in zip(files[1:], known, known[1:], strict=False):
-        if following != number + 1:
-            what = "is there twice" if following == number else f"{number + 1} is missing"
-            raise SourceError(
-                f"{folder}: frame {what} (before {path.name}); a gap shifts this camera against the others: "
-                "restore the file, or number the frames without gaps"
-            )
-    return ImageClip(files, known[0])
+    ordered = sorted(zip(known, files, strict=True), key=lambda pair: pair[0])
+    for (number, path), (following, other) in itertools.pairwise(ordered):
+        if following == number:
+            raise SourceError(f"{folder}: frame {number} is there twice: {path.name} and {other.name}")
+    return ImageClip([path for _, path in ordered], [number for number, _ in ordered])
 
 
 def _number(path: Path) -> int | None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import bisect
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from gsstream.core.errors import SourceError
 from gsstream.input.recordings.clips import Clip
@@ -29,41 +32,79 @@ class Alignment:
 
 
 def align(name: str, clips: Mapping[str, Clip]) -> Alignment:
-    """Lay clips beside each other; numbered images by their numbers, videos by counting.
+    """Lay clips beside each other; numbered images by their numbers, videos by counting, single pictures as they are.
 
-    Warns (RecordingWarning) about unequal lengths and numbers, videos that start at different times, and uneven time
-    stamps. Raises SourceError when no instant is common, or when rates differ so much that counting frames drifts.
+    Numbers may begin anywhere and leave some out, if all cameras leave out the same.
+
+    Warns (RecordingWarning) about unequal lengths and numbers, common gaps, videos that start at different times,
+    uneven time stamps, and what a video says of its pictures. Raises SourceError when no instant is common, for a gap
+    in one camera alone, or when rates differ so much that counting frames drifts.
     """
-    start = max(clip.first for clip in clips.values())
-    stop = min(clip.first + clip.num_frames for clip in clips.values())
-    if stop <= start:
-        raise SourceError(
-            f"recording {name!r}: no frame number is common to all cameras: "
-            + ", ".join(f"{i} has {c.first} to {c.first + c.num_frames - 1}" for i, c in clips.items())
-        )
-    notes = _lengths(clips, start, stop)
+    if all(clip.num_frames == 1 for clip in clips.values()):
+        shared: Sequence[int] = [0]
+        skip = dict.fromkeys(clips, 0)
+        notes: list[str] = []
+    else:
+        shared = _shared(name, clips)
+        skip = {i: bisect.bisect_left(clip.numbers, shared[0]) for i, clip in clips.items()}
+        notes = _lengths(clips, shared) + _common_gap(shared)
     videos = {i: clip for i, clip in clips.items() if isinstance(clip, VideoClip)}
-    fps = _common_rate(name, videos, stop - start) if videos else None
+    for doubt in dict.fromkeys(doubt for clip in videos.values() for doubt in clip.doubts):
+        notes.append(f"{', '.join(i for i, clip in videos.items() if doubt in clip.doubts)}: {doubt}")
+    fps = _common_rate(name, videos, len(shared)) if videos else None
     if fps:
         notes += _starts(videos, fps) + _uneven(videos)
     for note in notes:
         warnings.warn(f"recording {name!r}: {note}", RecordingWarning, stacklevel=2)
-    return Alignment(stop - start, {i: start - clip.first for i, clip in clips.items()}, fps)
+    return Alignment(len(shared), skip, fps)
 
 
-def _lengths(clips: Mapping[str, Clip], start: int, stop: int) -> list[str]:
-    spans = {(clip.first, clip.first + clip.num_frames) for clip in clips.values()}
-    if len(spans) == 1:
+def _shared(name: str, clips: Mapping[str, Clip]) -> list[int]:
+    """The numbers of the instants between the latest first and the earliest last picture, which all cameras have."""
+    start = max(clip.numbers[0] for clip in clips.values())
+    last = min(clip.numbers[-1] for clip in clips.values())
+    if last < start:
+        raise SourceError(
+            f"recording {name!r}: no frame number is common to all cameras: "
+            + ", ".join(f"{i} has {c.numbers[0]} to {c.numbers[-1]}" for i, c in clips.items())
+        )
+    inside = {i: {number for number in clip.numbers if start <= number <= last} for i, clip in clips.items()}
+    every = set().union(*inside.values())
+    for i, numbers in inside.items():
+        if lacking := sorted(every - numbers):
+            raise SourceError(
+                f"{clips[i].where}: camera {i!r}: frame {lacking[0]} is missing ({len(lacking)} of {len(every)} are), "
+                "which other cameras have; a gap shifts this camera against the others: restore the file, or number "
+                "the frames of all cameras alike"
+            )
+    return sorted(every)
+
+
+def _common_gap(shared: Sequence[int]) -> list[str]:
+    """A note where steps from one number to the next differ; every second number, say, is a rate and no gap."""
+    steps = np.diff(shared)
+    if not len(steps) or steps.min() == steps.max():
         return []
-    told = ", ".join(f"{i} {c.num_frames} from {c.first}" for i, c in clips.items() if c.num_frames != stop - start)
+    at = int(np.argmax(steps > steps.min()))
+    return [
+        f"no camera has a frame between the numbers {shared[at]} and {shared[at + 1]}; frames are counted, so that "
+        "everything jumps there"
+    ]
+
+
+def _lengths(clips: Mapping[str, Clip], shared: Sequence[int]) -> list[str]:
+    start, last, spans = shared[0], shared[-1], [(clip.numbers[0], clip.numbers[-1]) for clip in clips.values()]
+    if len(set(spans)) == 1:
+        return []
+    told = ", ".join(f"{i} {c.num_frames} from {c.numbers[0]}" for i, c in clips.items() if c.num_frames != len(shared))
     limits = [
         i
-        for i, c in clips.items()
-        if (c.first == start and any(o.first < start for o in clips.values()))
-        or (c.first + c.num_frames == stop and any(o.first + o.num_frames > stop for o in clips.values()))
+        for i, (first, end) in zip(clips, spans, strict=True)
+        if (first == start and any(other < start for other, _ in spans))
+        or (end == last and any(other > last for _, other in spans))
     ]
     return [
-        f"cameras differ in their frames ({told}); the {stop - start} common ones are used, from number {start}; the "
+        f"cameras differ in their frames ({told}); the {len(shared)} common ones are used, from number {start}; the "
         f"span is that of {', '.join(limits)}"
     ]
 

@@ -175,7 +175,8 @@ def raw_videos(folder: Path, frames: int, world: str) -> dict[str, list[np.ndarr
 
 def test_videos_are_raw_cameras(tmp_path: Path) -> None:
     shown = raw_videos(tmp_path / "raw", 2, WORLD)
-    cameras = find_cameras(tmp_path / "raw")
+    cameras, fps = find_cameras(tmp_path / "raw")
+    assert fps == pytest.approx(30)
     assert [camera.name for camera in cameras] == sorted(shown)
     for camera in cameras:
         assert camera.size == (240, 180)
@@ -184,24 +185,25 @@ def test_videos_are_raw_cameras(tmp_path: Path) -> None:
         assert len(list(camera.frames(1))) == 1
     path = tmp_path / "raw" / "cam01.mkv"
     path.write_bytes(path.read_bytes()[:300])
-    with pytest.raises(SourceError, match=r"cam01.mkv: the video (cannot be decoded|holds no frame)"):
+    with pytest.raises(SourceError, match=r"cam01.mkv: the video (cannot be opened|holds no pictures)"):
         find_cameras(tmp_path / "raw")
 
 
 @pytest.mark.sfm
 @needs_pycolmap
 def test_videos_without_poses_become_a_small_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One of them goes on for longer than the others, which is said."""
+    """One of them goes on for longer than the others, which is said; the scene has the rate of the videos."""
     moving = LARGE.replace("frames=1&static=true", "frames=2&supersample=1")
     shown = raw_videos(tmp_path / "raw", 2, moving)
     write_video(tmp_path / "raw" / "cam04.mkv", np.stack([*shown["cam04"], shown["cam04"][0]]))
     command = ["scene", "prepare", str(tmp_path / "raw"), "--out", str(tmp_path / "scene"), "--lens", "pinhole"]
-    assert run_command([*command, "--test", "test", "--width", "160"]) == 0
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if "cameras differ in their frames" in line]
-    assert "cam03 2, cam04 3, cam05 2" in line
-    assert line.endswith("; the first 2 are used")
+    assert run_command([*command, "--test", "test", "--width", "160", "--fps", "60"]) == 0
+    said = capsys.readouterr()
+    assert "differ in their frames (cam04 3 from 0); the 2 common ones are used" in said.err
+    assert "the recording has 30 frames per second; --fps 60 is not used" in said.out
     scene = open_source(str(tmp_path / "scene"))
     assert (scene.info.num_frames, scene.info.train.width, scene.info.train.height) == (2, 160, 120)
+    assert scene.info.fps == pytest.approx(30)
     blocks = np.stack([shown[name][1] for name in scene.info.train.ids]).reshape(-1, 120, 2, 160, 2, 3).mean((2, 4))
     assert np.abs(scene.frame(1).images * 255 - blocks).max() <= 1
 
@@ -230,7 +232,7 @@ def test_what_cannot_be_prepared_is_said(tmp_path: Path) -> None:
         find_cameras(tmp_path / "nowhere")
     (tmp_path / "raw").mkdir()
     save(tmp_path / "raw" / "only.png", np.zeros((8, 8, 3)))
-    with pytest.raises(SourceError, match="cameras found: 1; expected at least two"):
+    with pytest.raises(SourceError, match="expected at least two cameras"):
         find_cameras(tmp_path / "raw")
     save(tmp_path / "raw" / "other.png", np.zeros((8, 9, 3)))
     with pytest.raises(InputError, match=r"no two pictures share .*\(matches: only and other 0\); give poses instead"):
@@ -286,6 +288,9 @@ def test_cameras_of_other_sizes_are_brought_to_one(tmp_path: Path, capsys: pytes
     said = []
     prepare(raw, tmp_path / "scene", PrepareOptions(), said.append)
     assert any("minutes" in line for line in said), "what takes long is said before it begins"
+    (line,) = [line for line in said if "all pictures become 240 x 180" in line]
+    assert all(f"{name} 520 x 360" in line and f"--without {name}" not in line for name in odd)
+    assert line.endswith(" ".join(f"--without {name}" for name in (*rig.train.ids, *rig.test.ids) if name not in odd))
     scene, world = open_source(str(tmp_path / "scene")), open_source(WORLD)
     assert np.allclose(scene.info.train.Ks, rig.train.Ks, rtol=1e-9)
     assert np.allclose(scene.info.test.Ks, rig.test.Ks, rtol=1e-9)

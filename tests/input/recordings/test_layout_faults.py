@@ -86,8 +86,9 @@ FAULTS: dict[str, tuple[str, Callable[[Path], Any], str]] = {
     "shape": ("n3dv images", edit_rows(set_cell(1, 4, 48)), "calibrated for 48 x 48, but the pictures are 48 x 32"),
     "handedness": ("n3dv images", edit_rows(set_cell(1, 1, 9)), "'cam01': the 3x3 part is not a rotation"),
     "npy": ("n3dv images", lambda f: (f / "poses_bounds.npy").write_bytes(b"no array"), "cannot be read as a numpy"),
-    "gap": ("n3dv images", lambda f: write_frames(f / "cam01/images", np.zeros((1, 32, 48, 3), np.uint8), first=3),
-            "frame 2 is missing"),
+    "gap": ("n3dv images", lambda f: [write_frames(f / f"cam0{c}/images", np.zeros((2, 32, 48, 3), np.uint8),
+                                                   first=3 if c == 1 else 2) for c in range(4)],
+            "camera 'cam01': frame 2 is missing"),
     "size": ("n3dv images", lambda f: [write_png(f / f"cam02/images/000{t}.png", np.zeros((16, 24, 3), np.uint8))
                                        for t in (0, 1)], "pictures of camera 'cam02' are 24 x 16 pixels"),
     "late size": ("n3dv images", lambda f: write_png(f / "cam02/images/0001.png", np.zeros((8, 8, 3), np.uint8)),

@@ -273,14 +273,14 @@ def test_cameras_json_takes_videos_and_lenses_without_naming_its_schema(tmp_path
     assert np.abs(source.frame(1).images - expected.frame(0).images).max() > 0.1
     held = transformed(source, DataOptions(test_cameras=(NAMES[0],)))
     assert (len(source.points() or ()), held.points()) == (2, None), "nobody says that it took no part in them"
-    (_, raw, rig), (_, _, known) = read_raw(str(folder)), read_raw(str(reference))
-    assert rig is not None
+    raw, known = read_raw(str(folder)), read_raw(str(reference)).known
+    assert raw.known is not None
     assert known is not None
-    for got, wanted in zip(rig.lenses, known.lenses, strict=True):
+    for got, wanted in zip(raw.known.lenses, known.lenses, strict=True):
         assert got.kind == wanted.kind
         assert np.allclose((*got.k[:3], *got.p), (*wanted.k[:3], *wanted.p))
-    assert np.allclose(rig.Ks, known.Ks)
-    assert [len(list(camera.frames(None))) for camera in raw] == [2, 2, 2]
+    assert np.allclose(raw.known.Ks, known.Ks)
+    assert [len(list(camera.frames(None))) for camera in raw.cameras] == [2, 2, 2]
     declared(folder, 1)
     assert open_source(str(folder)).info.num_frames == 1
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import struct
 import warnings
 from collections.abc import Iterator
 from fractions import Fraction
@@ -186,10 +187,14 @@ def test_numbered_images_are_laid_beside_each_other_by_number(tmp_path: Path) ->
         found = align("r", clips)
     assert (found.num_frames, dict(found.skip)) == (4, {"a": 2, "b": 0})
     (tmp_path / "b" / "0013.png").unlink()
-    with pytest.raises(SourceError, match="frame 13 is missing"):
-        folder_clip(tmp_path / "b")
+    with pytest.raises(SourceError, match=r"b: camera 'b': frame 13 is missing \(1 of 4 are\)"):
+        align("r", {"a": folder_clip(tmp_path / "a"), "b": folder_clip(tmp_path / "b")})
+    (tmp_path / "a" / "0013.png").unlink()
+    with pytest.warns(RecordingWarning, match="no camera has a frame between the numbers 12 and 14"):
+        found = align("r", {"a": folder_clip(tmp_path / "a"), "b": folder_clip(tmp_path / "b")})
+    assert (found.num_frames, dict(found.skip)) == (3, {"a": 2, "b": 0})
     with pytest.raises(SourceError, match="no frame number is common"):
-        align("r", {"a": folder_clip(tmp_path / "a"), "b": ImageClip([tmp_path / "a" / "0010.png"], first=90)})
+        align("r", {"a": folder_clip(tmp_path / "a"), "b": ImageClip([tmp_path / "a" / "0010.png"], [90])})
 
 
 def test_a_cut_video_is_read_up_to_the_cut_or_refused(tmp_path: Path) -> None:
@@ -239,38 +244,106 @@ def test_a_rig_of_videos_from_many_threads(tmp_path: Path) -> None:
             np.testing.assert_array_equal(np.round(test.images * 255), world.pictures[test.index, :1])
 
 
-@pytest.mark.parametrize("degrees", [90, -90, 180, 0])
-def test_a_film_of_a_turned_phone_comes_upright(degrees: int, tmp_path: Path) -> None:
-    """The display matrix says how to turn what is stored; ``rotation`` counts counterclockwise."""
-    from gsstream.input.prepare.raw import find_cameras
+ONE = 1 << 16
+#: Display matrix (a, b, c, d) of a track, which shows what lies at x, y at a x + c y, b x + d y -> pictures as shown.
+SHOWN = {
+    (1, 0, 0, 1): lambda p: p,
+    (0, 1, -1, 0): lambda p: np.rot90(p, -1, axes=(1, 2)),
+    (-1, 0, 0, -1): lambda p: np.rot90(p, 2, axes=(1, 2)),
+    (0, -1, 1, 0): lambda p: np.rot90(p, 1, axes=(1, 2)),
+    (-1, 0, 0, 1): lambda p: p[:, :, ::-1],
+    (1, 0, 0, -1): lambda p: p[:, ::-1],
+    (0, 1, 1, 0): lambda p: p.transpose(0, 2, 1, 3),
+    (0, -1, -1, 0): lambda p: p[:, ::-1, ::-1].transpose(0, 2, 1, 3),
+}
 
+
+def set_display_matrix(path: Path, a: int, b: int, c: int, d: int) -> None:
+    """Overwrite the matrix in the track header of an MP4 (version 0)."""
+    data = bytearray(path.read_bytes())
+    at = data.find(b"tkhd") + 4 + 4 + 20 + 16
+    data[at : at + 36] = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("matrix", SHOWN)
+def test_a_film_comes_as_its_display_matrix_says(matrix: tuple[int, int, int, int], tmp_path: Path) -> None:
+    """Turned phones and selfie cameras: four turns, and the mirror image of each."""
     stored = numbered(3)
     for camera in ("a", "b"):
-        path = tmp_path / f"{camera}.mp4"
-        with av.open(str(path), "w") as container:
-            stream = container.add_stream("libx264rgb", rate=30)
-            stream.height, stream.width = stored.shape[1:3]
-            stream.pix_fmt, stream.options = "rgb24", {"qp": "0", "bf": "0"}
-            stream.set_display_rotation(degrees)
-            for picture in stored:
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
-            container.mux(stream.encode())
-    with av.open(str(path)) as container:
-        told = next(container.decode(video=0)).rotation
-    assert abs(told) == abs(degrees), "the sign is the library's, the turn is what it tells"
-    expected = np.rot90(stored, told // 90, axes=(1, 2))
-    clip = VideoClip(path)
+        write_video(tmp_path / f"{camera}.mp4", stored)
+        set_display_matrix(tmp_path / f"{camera}.mp4", *(ONE * number for number in matrix))
+    expected = SHOWN[matrix](stored)
+    clip = VideoClip(tmp_path / "b.mp4")
     assert clip.size == (expected.shape[2], expected.shape[1])
     for index in (2, 0, 1):
         assert np.array_equal(clip.read(index, clip.size), expected[index])
-    camera = find_cameras(tmp_path)[0]
-    assert camera.size == clip.size
-    for image, picture in zip(camera.frames(None), expected, strict=True):
-        assert np.array_equal(np.rint(image * 255).astype(np.uint8), picture)
+    with av.open(str(tmp_path / "b.mp4")) as container:
+        told = next(container.decode(video=0)).rotation
+    if matrix[0] * matrix[3] - matrix[1] * matrix[2] > 0:
+        assert np.array_equal(expected, np.rot90(stored, told // 90, axes=(1, 2))), "as the library has it"
 
 
 def test_a_film_turned_by_a_crooked_angle_is_refused(tmp_path: Path) -> None:
-    from gsstream.input.recordings.video import upright
+    write_video(tmp_path / "x.mp4", numbered(2))
+    set_display_matrix(tmp_path / "x.mp4", 46341, 46341, -46341, 46341)
+    with pytest.raises(SourceError, match=r"x\.mp4: the file says to turn .* multiple of 90"):
+        VideoClip(tmp_path / "x.mp4")
 
-    with pytest.raises(SourceError, match="multiple of 90"):
-        upright(np.zeros((2, 3, 3), np.uint8), 45, tmp_path / "x.mp4")
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_a_cover_picture_is_no_film(suffix: str, tmp_path: Path) -> None:
+    """Drones and tagged files put one picture in front of the film, as a stream of its own."""
+    pictures = numbered(6)
+    with av.open(str(tmp_path / f"a.{suffix}"), "w") as container:
+        cover, film = container.add_stream("mjpeg", rate=30), container.add_stream("libx264rgb", rate=30)
+        for stream, kind in ((cover, "yuvj420p"), (film, "rgb24")):
+            stream.width, stream.height, stream.pix_fmt = *SIZE, kind
+        film.options = {"qp": "0"}
+        if suffix == "mkv":
+            cover.disposition = av.stream.Disposition.attached_pic
+        for stream, shown in ((cover, pictures[:1]), (film, pictures)):
+            for picture in shown:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            container.mux(stream.encode())
+    clip = VideoClip(tmp_path / f"a.{suffix}")
+    assert (clip.num_frames, clip.doubts) == (6, ())
+    assert [number_of(clip.read(i, SIZE)) for i in (5, 0, 3)] == [5, 0, 3]
+
+
+@pytest.mark.parametrize("hidden", [1, 5, 8])
+def test_a_film_cut_without_reencoding_begins_at_the_cut(hidden: int, tmp_path: Path) -> None:
+    """An edit list hides the pictures between a key frame and the cut; groups of 6 with B-frames."""
+    write_video(tmp_path / "whole.mp4", numbered(16), g=6, bf=2)
+    cut = {"avoid_negative_ts": "disabled"}
+    with av.open(str(tmp_path / "whole.mp4")) as old, av.open(str(tmp_path / "cut.mp4"), "w", options=cut) as new:
+        stream = new.add_stream_from_template(old.streams.video[0])
+        step = int(1 / 30 / old.streams.video[0].time_base)
+        for packet in old.demux(video=0):
+            if packet.dts is not None:
+                packet.pts, packet.dts, packet.stream = packet.pts - hidden * step, packet.dts - hidden * step, stream
+                new.mux(packet)
+    clip = VideoClip(tmp_path / "cut.mp4")
+    assert clip.num_frames == 16 - hidden
+    order = [*range(clip.num_frames), *reversed(range(clip.num_frames)), 3, 0, 5]
+    assert [number_of(clip.read(i, SIZE)) - hidden for i in order] == order
+
+
+@pytest.mark.parametrize(("curve", "told"), [("smpte2084", "PQ"), ("arib-std-b67", "HLG"), ("bt709", "")])
+def test_high_dynamic_range_is_said_with_its_cure(curve: str, told: str, tmp_path: Path) -> None:
+    for name in "ab":
+        path = tmp_path / f"{name}.mp4"
+        write_video(path, numbered(3), codec="libx264", qp=10, **{"x264-params": f"transfer={curve}"})
+    clips = {name: VideoClip(tmp_path / f"{name}.mp4") for name in "ab"}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        align("r", clips)
+    text = [str(warning.message) for warning in caught]
+    assert len(text) == bool(told), "once for all cameras"
+    assert all(f"a, b: high dynamic range ({told})" in line and "BT.709" in line for line in text)
+
+
+def test_interlaced_films_are_said_with_their_cure(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", numbered(4), codec="libx264", qp=10, flags="+ildct+ilme")
+    with pytest.warns(RecordingWarning, match="a: interlaced pictures, which comb .*bwdif"):
+        align("r", {"a": VideoClip(tmp_path / "a.mp4")})

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gsstream.core.errors import SourceError
-from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, images_in
+from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, clips_in, files_in, folders_in
 from gsstream.input.recordings.foreign import left_out
 from gsstream.input.recordings.recorded import Recording
 from gsstream.input.recordings.rigs import metashape, opencv_yaml, qualisys, realitycapture, toml
@@ -21,6 +21,7 @@ from gsstream.input.recordings.sync import RecordingWarning
 
 READERS = (qualisys, toml, opencv_yaml, metashape, realitycapture)
 PLACES = (".", "calibration", "images")
+SUFFIXES = tuple({suffix for reader in READERS for suffix in reader.SUFFIXES})
 #: Larger files are no calibration.
 LARGEST = 1 << 24
 
@@ -59,7 +60,7 @@ def read(folder: Path) -> Recording:
 
 def _found(folder: Path) -> Iterator[list[tuple[Path, list[RigCamera]]]]:
     """For every format of which there are files: those files, in order of their names, and their cameras."""
-    files = [path for place in PLACES if (folder / place).is_dir() for path in sorted((folder / place).iterdir())]
+    files = [path for place in PLACES for path in files_in(folder / place, SUFFIXES)]
     for reader in READERS:
         rig = [(path, reader.read(path, _text(path))) for path in files if path.suffix.lower() in reader.SUFFIXES]
         if rig := [(path, cameras) for path, cameras in rig if cameras]:
@@ -74,23 +75,8 @@ def _text(path: Path) -> str:
 
 
 def _clips(folder: Path) -> dict[str, Clip]:
-    inside = [path for path in sorted(folder.iterdir()) if path.is_dir()]
-    with_videos = [path for path in inside if len(_videos(path)) > 1]
+    with_videos = [path for path in folders_in(folder) if len(files_in(path, VIDEO_SUFFIXES)) > 1]
     places = [folder, folder / "videos", folder / "images", *(with_videos if len(with_videos) == 1 else [])]
-    for place in places:
-        if len(videos := _videos(place)) > 1:
-            from gsstream.input.recordings.video import VideoClip
-
-            return {path.stem: VideoClip(path) for path in videos}
-    for place in places:
-        cameras = [path for path in sorted(place.iterdir()) if images_in(path)] if place.is_dir() else []
-        if len(cameras) > 1:
-            return {path.name: folder_clip(path) for path in cameras}
-    for place in places:
-        if len(pictures := images_in(place)) > 1:
-            return {path.stem: ImageClip([path]) for path in pictures}
+    if clips := clips_in(places):
+        return clips
     raise SourceError(f"{folder}: no videos or pictures of two cameras or more, here, in videos/ or in images/")
-
-
-def _videos(place: Path) -> list[Path]:
-    return [p for p in sorted(place.iterdir()) if p.suffix.lower() in VIDEO_SUFFIXES] if place.is_dir() else []

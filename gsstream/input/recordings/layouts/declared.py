@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import itertools
+import re
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -45,7 +48,8 @@ def read(folder: Path, *, any_sizes: bool = False) -> Recording:
 def _clip(folder: Path, known: Calibration, name: str) -> Clip:
     pattern = known.patterns[name]
     if not is_video(pattern):
-        return ImageClip([folder / frame_path(pattern, t) for t in range(known.num_frames)])
+        numbers = frame_numbers(folder, pattern, known.num_frames)
+        return ImageClip([folder / frame_path(pattern, number) for number in numbers], numbers)
     from gsstream.input.recordings.video import VideoClip
 
     return VideoClip(folder / pattern, known.num_frames or None)
@@ -78,15 +82,31 @@ def check_files(folder: Path, calibration: Calibration) -> None:
 
 def _check_images(folder: Path, camera_id: str, pattern: str, count: int) -> None:
     _check_span(folder, camera_id, pattern, count)
-    paths = [folder / frame_path(pattern, t) for t in range(count)]
-    missing = [p for p in paths if not p.is_file()]
-    if len(missing) == len(paths):
-        raise FilesMissing(f"{folder}: camera {camera_id!r} has no frames; expected {missing[0]} and its followers")
-    if missing:
+    numbers = frame_numbers(folder, pattern, count)
+    if len(numbers) < count:
+        there = frozenset(numbers)
+        path = folder / frame_path(pattern, next(t for t in range(count + 1) if t not in there))
+        if not numbers:
+            raise FilesMissing(f"{folder}: camera {camera_id!r} has no frames; expected {path} and its followers")
         raise FilesMissing(
-            f"{folder}: camera {camera_id!r}: {len(missing)} of {len(paths)} frames are missing, the first is "
-            f'{missing[0]}; restore them or lower "frames" in cameras.json'
+            f"{folder}: camera {camera_id!r}: {count - len(numbers)} of {count} frames are missing, the first is "
+            f'{path}; restore them or lower "frames" in cameras.json'
         )
+
+
+def frame_numbers(folder: Path, pattern: str, count: int) -> Sequence[int]:
+    """Return the numbers of a camera's first ``count`` images, ascending; fewer where there are fewer.
+
+    They need not begin at 0, nor follow each other: what other cameras have decides whether one is missing.
+    """
+    if all((folder / frame_path(pattern, number)).is_file() for number in range(count)):
+        return range(count)
+    parts = PurePosixPath(pattern).parts
+    place = folder.joinpath(*itertools.takewhile(lambda part: "%" not in part, parts[:-1]))
+    names = [path.name for path in place.iterdir()] if place.is_dir() else []
+    numbers = sorted({int(digits) for name in names for digits in re.findall(r"\d+", name)})
+    there = (number for number in numbers if (folder / frame_path(pattern, number)).is_file())
+    return list(itertools.islice(there, count))
 
 
 def _check_span(folder: Path, camera_id: str, pattern: str, count: int) -> None:

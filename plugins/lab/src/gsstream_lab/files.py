@@ -16,11 +16,10 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.evaluation.seen import seen_masks
 from gsstream.input.recordings.base import SourceInfo
-from gsstream.input.recordings.images import PICTURE_FORMATS
+from gsstream.input.recordings.clips import IMAGE_SUFFIXES, files_in
+from gsstream.input.recordings.images import PICTURE_FORMATS, UNDECODABLE
 from gsstream.player.ply import read_ply
 from gsstream.player.render import find_renderer, render
-
-_PICTURES = (".png", ".jpg", ".jpeg")
 
 
 def numbered(folder: Path, suffixes: Sequence[str], first: int) -> dict[int, Path]:
@@ -31,7 +30,7 @@ def numbered(folder: Path, suffixes: Sequence[str], first: int) -> dict[int, Pat
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder; expected one with files such as 000000{suffixes[0]}")
     found: dict[int, Path] = {}
-    for path in sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes):
+    for path in files_in(folder, suffixes):
         digits = re.findall(r"\d+", path.stem)
         if not digits or int(digits[-1]) < first:
             raise InputError(f"{path}: expected a name that ends with a number from {first} on, which is its frame")
@@ -99,7 +98,7 @@ class Renders:
                 f"{', '.join(missing)}"
             )
         self._files = {
-            name: numbered(folder if name in missing else path, _PICTURES, first) for name, path in folders.items()
+            name: numbered(folder if name in missing else path, IMAGE_SUFFIXES, first) for name, path in folders.items()
         }
         one, *others = self._files.values()
         if any(set(other) != set(one) for other in others):
@@ -119,15 +118,16 @@ class Renders:
     def _image(self, path: Path) -> FloatArray:
         try:
             with Image.open(path, formats=PICTURE_FORMATS) as file:
-                image = np.asarray(file.convert("RGB"), np.float32) / 255
-        except OSError as error:
+                if file.size != (self.rig.width, self.rig.height):
+                    raise InputError(
+                        f"{path}: expected {self.rig.width} x {self.rig.height} pixels as the recording has at this "
+                        f"--scale, got {file.width} x {file.height}"
+                    )
+                return np.asarray(file.convert("RGB"), np.float32) / 255
+        except InputError:  # is a ValueError, too
+            raise
+        except UNDECODABLE as error:
             raise InputError(f"{path} cannot be read as a picture: {error}") from error
-        if image.shape[:2] != (self.rig.height, self.rig.width):
-            raise InputError(
-                f"{path}: expected {self.rig.width} x {self.rig.height} pixels as the recording has at this --scale, "
-                f"got {image.shape[1]} x {image.shape[0]}"
-            )
-        return image
 
 
 def bytes_line(files: Sequence[Path], frames: int) -> str:

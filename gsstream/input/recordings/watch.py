@@ -19,6 +19,7 @@ from gsstream.input.recordings.base import Moment, PointKind, Source, SourceInfo
 from gsstream.input.recordings.calibration import CALIBRATION_FILE, Calibration, frame_path, is_video, read_calibration
 from gsstream.input.recordings.depth_maps import FOLDER
 from gsstream.input.recordings.images import read_stored, scaled_size
+from gsstream.input.recordings.layouts.declared import numbers_there
 from gsstream.input.recordings.options import WatchOptions, options_of_query
 from gsstream.input.recordings.pointfiles import POINTS_FILE, read_points
 
@@ -67,6 +68,7 @@ class WatchSource(Source):
         )
         self._plans: dict[int, _Plan] = {}  # only frames that are not delivered whole
         self._next, self._skip_to, self._newest = 0, 0, 0
+        self._numbers = [0]  # frame -> number of its files; the last one is a guess until a file is there
         self._decoded: dict[tuple[str, int], Any] = {}  # of the frame that is waited for
         self._faults: dict[str, str] = {}
         self._last: dict[str, int] = {}
@@ -145,7 +147,9 @@ class WatchSource(Source):
         return packed(read_stored(self._path(camera_id, index), self._native, self._target))
 
     def _path(self, camera_id: str, index: int) -> Path:
-        return self._folder / frame_path(self._patterns[camera_id], index)
+        known = len(self._numbers) - 1
+        number = self._numbers[index] if index <= known else self._numbers[known] + index - known
+        return self._folder / frame_path(self._patterns[camera_id], number)
 
     def _plan(self, index: int) -> _Plan:
         """Return the plan of a frame, which is made once and kept. Raises EndOfRecording where there is no frame."""
@@ -195,30 +199,62 @@ class WatchSource(Source):
 
     def _wait(self, index: int) -> list[str]:
         """Wait until every camera's image is there and whole, or the policy gives up; the cameras that are absent."""
+        if index >= len(self._numbers):
+            self._numbers += range(self._numbers[-1] + 1, self._numbers[-1] + 2 + index - len(self._numbers))
         seen: dict[str, tuple[int, int]] = {}
         whole: set[str] = set()
+        stepped = index > 1 and self._numbers[index - 1] > self._numbers[index - 2] + 1
+        pause = self._options.poll if stepped else max(self._options.grace, 1.0)  # between looks at whole folders
+        due = 0.0 if stepped else pause
         self._decoded, self._faults = {}, {}
-        changed = began = time.monotonic()
+        changed = began = came = time.monotonic()
         given_up: list[str] = []
         while True:
             ended = (self._folder / self._options.end).exists()
             before = dict(seen)
             open_names = [name for name in self._ids if name not in whole]
             settled = [name for name in open_names if self._settled(name, index, seen, changed=changed, ended=ended)]
-            whole |= {name for name in settled if self._decodes(name, index)}
+            decoded = {name for name in settled if self._decodes(name, index)}
+            came = time.monotonic() if decoded else came
+            whole |= decoded
             absent = [name for name in self._ids if name not in whole]
             if not absent:
                 return []
             now = time.monotonic()
             changed = now if seen != before else changed
-            if self._give_up(index, absent, whole, now - began):
+            over = ended or now - changed >= self._options.timeout
+            if not seen and (over or now - began >= due):
+                due += pause
+                if self._left_out(index, over):
+                    changed = now
+                    continue
+            if self._give_up(index, absent, whole, waited=now - came, over=over):
                 if absent == given_up:
                     return absent
                 given_up = absent  # and one more look: an image may have come during this one
                 continue
-            if ended or self._stop.is_set() or now - changed >= self._options.timeout:
+            if over or self._stop.is_set():
                 self._end(index, absent, ended)
             self._stop.wait(self._options.poll)
+
+    def _left_out(self, index: int, over: bool) -> bool:
+        """Whether all cameras left out the number that a frame was thought to have; then it has their next one.
+
+        ``over``: nothing more comes, so that the next number of any camera will do.
+        """
+        every = (numbers_there(self._folder, self._patterns[name], self._numbers[index]) for name in self._ids)
+        later = [next(numbers, None) for numbers in every]
+        there = [number for number in later if number is not None]
+        if not there or not (over or len(there) == len(later)):
+            return False
+        if index:
+            warnings.warn(
+                f"{self._folder}: no camera has a frame between the numbers {self._numbers[index - 1]} and "
+                f"{min(there)}; frames are counted, so that everything jumps there",
+                stacklevel=2,
+            )
+        self._numbers[index] = min(there)
+        return True
 
     def _settled(self, name: str, index: int, seen: dict[str, tuple[int, int]], changed: float, ended: bool) -> bool:
         """Whether a camera's file counts as written; ``seen`` remembers (size, time of change) of the last look."""
@@ -243,9 +279,17 @@ class WatchSource(Source):
             return False
         return True
 
-    def _give_up(self, index: int, absent: list[str], whole: set[str], waited: float) -> bool:
-        """Whether the absent cameras have had their grace, counted from the newest image of the others."""
-        if self._options.missing == "wait" or not whole or index == 0:
+    def _give_up(self, index: int, absent: list[str], whole: set[str], waited: float, over: bool) -> bool:
+        """Whether the absent cameras have had their grace, counted from the newest image of the others.
+
+        ``over``: nothing more comes, so that the frame is made of what is there, unless it is the last and nothing is.
+        """
+        if self._options.missing == "wait" or index == 0:
+            return False
+        if over:
+            patterns = (self._patterns[name] for name in self._ids)
+            return bool(whole) or any(any(numbers_there(self._folder, p, self._numbers[index])) for p in patterns)
+        if not whole:
             return False
         if all(self._path(name, index + 1).exists() for name in absent):
             return True  # they have moved on: this image will not come

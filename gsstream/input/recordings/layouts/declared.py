@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -101,12 +101,18 @@ def frame_numbers(folder: Path, pattern: str, count: int) -> Sequence[int]:
     """
     if all((folder / frame_path(pattern, number)).is_file() for number in range(count)):
         return range(count)
+    return list(itertools.islice(numbers_there(folder, pattern), count))
+
+
+def numbers_there(folder: Path, pattern: str, above: int = -1) -> Iterator[int]:
+    """Yield the numbers above ``above`` of which a camera has an image, ascending, whichever those are."""
     parts = PurePosixPath(pattern).parts
     place = folder.joinpath(*itertools.takewhile(lambda part: "%" not in part, parts[:-1]))
     names = [path.name for path in place.iterdir()] if place.is_dir() else []
-    numbers = sorted({int(digits) for name in names for digits in re.findall(r"\d+", name)})
-    there = (number for number in numbers if (folder / frame_path(pattern, number)).is_file())
-    return list(itertools.islice(there, count))
+    numbers = {int(digits) for name in names for digits in re.findall(r"\d+", name)}
+    for number in sorted(numbers):
+        if number > above and (folder / frame_path(pattern, number)).is_file():
+            yield number
 
 
 def _check_span(folder: Path, camera_id: str, pattern: str, count: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,6 +11,10 @@ from gsstream.cli import options
 from gsstream.cli.working import working
 from gsstream.core.errors import InputError
 from gsstream.core.install_hints import page
+
+if TYPE_CHECKING:
+    from gsstream.input.prepare.findings import Finding
+    from gsstream.input.prepare.prepare import Prepared
 
 app = typer.Typer(
     help="Prepare and validate scenes.", no_args_is_help=True, rich_markup_mode=None, add_completion=False
@@ -41,9 +45,7 @@ def prepare(
     each: Annotated[bool, typer.Option("--each", help="A lens per camera; else all cameras share one.")] = False,
     frames: Annotated[int | None, typer.Option("--frames", help="Frames to take over; all by default.")] = None,
     width: Annotated[int | None, typer.Option("--width", help="Shrink pictures to this width.")] = None,
-    fps: Annotated[
-        float | None, typer.Option("--fps", help="Frames per second, where RAW does not say; 30 by default.")
-    ] = None,
+    fps: Annotated[float | None, typer.Option("--fps", help="Frames per second, where RAW does not say.")] = None,
     without: Annotated[
         list[str] | None, typer.Option("--without", metavar="ID", help="Camera that is left out; repeatable.")
     ] = None,
@@ -79,6 +81,15 @@ def prepare(
         # The features have just been matched; how well they fit is in the report.
         found = find(lambda scale: open_source(str(out), scale), features=False)
         written = write_report(out, made, found, time.perf_counter() - began)
+    _tell(made, found)
+    if not quiet:
+        typer.echo("\n".join(f"wrote {path}" for path in (out / "cameras.json", *written)))
+    if any(finding.severity == "error" for finding in found):
+        raise typer.Exit(2)
+
+
+def _tell(made: Prepared, found: list[Finding]) -> None:
+    """What the user has to know of a scene that was made."""
     for finding in found:
         typer.echo(f"{finding.severity}: [{finding.code}] {finding.message}", err=True)
     if made.points is None:
@@ -89,10 +100,6 @@ def prepare(
         )
     if made.left_out:
         typer.echo(f"warning: no pose was found for {', '.join(made.left_out)}; they are left out", err=True)
-    if not quiet:
-        typer.echo("\n".join(f"wrote {path}" for path in (out / "cameras.json", *written)))
-    if any(finding.severity == "error" for finding in found):
-        raise typer.Exit(2)
 
 
 @app.command()

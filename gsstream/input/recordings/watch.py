@@ -16,10 +16,10 @@ from gsstream.core.frame import Arrival, Frame, PointCloud
 from gsstream.core.shapes import FloatArray
 from gsstream.core.storage import packed, unpacked
 from gsstream.input.recordings.base import Moment, PointKind, Source, SourceInfo, Split, assembled
-from gsstream.input.recordings.calibration import CALIBRATION_FILE, Calibration, frame_path, is_video, read_calibration
+from gsstream.input.recordings.calibration import CALIBRATION_FILE, Calibration, is_video, read_calibration
 from gsstream.input.recordings.depth_maps import FOLDER
 from gsstream.input.recordings.images import read_stored, scaled_size
-from gsstream.input.recordings.layouts.declared import numbers_there
+from gsstream.input.recordings.numbering import Numbering
 from gsstream.input.recordings.options import WatchOptions, options_of_query
 from gsstream.input.recordings.pointfiles import POINTS_FILE, read_points
 
@@ -52,7 +52,6 @@ class WatchSource(Source):
         _check_patterns(folder, calibration)
         self._native = (calibration.train.width, calibration.train.height)
         self._target = scaled_size(self._native, scale)
-        self._patterns = calibration.patterns
         self._ids = (*calibration.train.ids, *calibration.test.ids)
         self._train = frozenset(calibration.train.ids)
         self._declared = calibration.num_frames or None
@@ -68,7 +67,7 @@ class WatchSource(Source):
         )
         self._plans: dict[int, _Plan] = {}  # only frames that are not delivered whole
         self._next, self._skip_to, self._newest = 0, 0, 0
-        self._numbers = [0]  # frame -> number of its files; the last one is a guess until a file is there
+        self._numbers = Numbering(folder, calibration.patterns)
         self._decoded: dict[tuple[str, int], Any] = {}  # of the frame that is waited for
         self._faults: dict[str, str] = {}
         self._last: dict[str, int] = {}
@@ -147,9 +146,7 @@ class WatchSource(Source):
         return packed(read_stored(self._path(camera_id, index), self._native, self._target))
 
     def _path(self, camera_id: str, index: int) -> Path:
-        known = len(self._numbers) - 1
-        number = self._numbers[index] if index <= known else self._numbers[known] + index - known
-        return self._folder / frame_path(self._patterns[camera_id], number)
+        return self._numbers.path(camera_id, index)
 
     def _plan(self, index: int) -> _Plan:
         """Return the plan of a frame, which is made once and kept. Raises EndOfRecording where there is no frame."""
@@ -199,11 +196,9 @@ class WatchSource(Source):
 
     def _wait(self, index: int) -> list[str]:
         """Wait until every camera's image is there and whole, or the policy gives up; the cameras that are absent."""
-        if index >= len(self._numbers):
-            self._numbers += range(self._numbers[-1] + 1, self._numbers[-1] + 2 + index - len(self._numbers))
         seen: dict[str, tuple[int, int]] = {}
         whole: set[str] = set()
-        stepped = index > 1 and self._numbers[index - 1] > self._numbers[index - 2] + 1
+        stepped = self._numbers.begin(index)
         pause = self._options.poll if stepped else max(self._options.grace, 1.0)  # between looks at whole folders
         due = 0.0 if stepped else pause
         self._decoded, self._faults = {}, {}
@@ -225,7 +220,7 @@ class WatchSource(Source):
             over = ended or now - changed >= self._options.timeout
             if not seen and (over or now - began >= due):
                 due += pause
-                if self._left_out(index, over):
+                if self._numbers.left_out(index, over):
                     changed = now
                     continue
             if self._give_up(index, absent, whole, waited=now - came, over=over):
@@ -236,25 +231,6 @@ class WatchSource(Source):
             if over or self._stop.is_set():
                 self._end(index, absent, ended)
             self._stop.wait(self._options.poll)
-
-    def _left_out(self, index: int, over: bool) -> bool:
-        """Whether all cameras left out the number that a frame was thought to have; then it has their next one.
-
-        ``over``: nothing more comes, so that the next number of any camera will do.
-        """
-        every = (numbers_there(self._folder, self._patterns[name], self._numbers[index]) for name in self._ids)
-        later = [next(numbers, None) for numbers in every]
-        there = [number for number in later if number is not None]
-        if not there or not (over or len(there) == len(later)):
-            return False
-        if index:
-            warnings.warn(
-                f"{self._folder}: no camera has a frame between the numbers {self._numbers[index - 1]} and "
-                f"{min(there)}; frames are counted, so that everything jumps there",
-                stacklevel=2,
-            )
-        self._numbers[index] = min(there)
-        return True
 
     def _settled(self, name: str, index: int, seen: dict[str, tuple[int, int]], changed: float, ended: bool) -> bool:
         """Whether a camera's file counts as written; ``seen`` remembers (size, time of change) of the last look."""
@@ -287,8 +263,7 @@ class WatchSource(Source):
         if self._options.missing == "wait" or index == 0:
             return False
         if over:
-            patterns = (self._patterns[name] for name in self._ids)
-            return bool(whole) or any(any(numbers_there(self._folder, p, self._numbers[index])) for p in patterns)
+            return bool(whole) or self._numbers.goes_on(index)
         if not whole:
             return False
         if all(self._path(name, index + 1).exists() for name in absent):

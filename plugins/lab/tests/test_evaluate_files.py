@@ -121,3 +121,9 @@ def test_the_recipe_of_a_recording_is_named(capsys, tmp_path: Path) -> None:
     assert "did you mean 'n3dv'" in capsys.readouterr().err
     assert run_command([*command, "recording:enerf_outdoor"]) == 2
     assert "data.test_cameras" in capsys.readouterr().err
+
+
+def test_hidden_twins_of_a_mac_are_no_frames(tmp_path: Path) -> None:
+    for name in ("000000.ply", "000001.ply", "._000000.ply", "._000001.ply"):
+        (tmp_path / name).touch()
+    assert [path.name for path in numbered(tmp_path, (".ply",), 0).values()] == ["000000.ply", "000001.ply"]

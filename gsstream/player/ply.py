@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,6 +12,10 @@ import numpy as np
 from gsstream.core.errors import InputError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
+from gsstream.core.vertices import read_vertices
+
+#: Logit of an opacity of 1 - 2e-9, which no renderer tells from 1.
+MOST_OPAQUE = 20.0
 
 
 def ply_properties(sh_rest: int) -> list[str]:
@@ -49,70 +54,65 @@ def write_ply(path: str | os.PathLike[str], gaussians: Gaussians[FloatArray], co
 def read_ply(path: str | os.PathLike[str]) -> tuple[Gaussians[FloatArray], tuple[float, float, float]]:
     """Read a binary 3DGS PLY: (raw values, float32; the offset that a comment of its header states, else zeros).
 
-    Properties may stand in any order; others than those of the release are passed over.
+    Properties and elements may stand in any order; others than those of the release are passed over. Opacities of
+    infinity, which some programs write for a splat that covers all behind it, become logits of 20,
+    an opacity of 1 - 2e-9; a warning says how many.
 
-    Raises InputError for a file that is not such a PLY, naming what is missing.
+    Raises InputError for a file that is not such a PLY, naming what is missing, and for values that are not finite.
     """
     try:
         data = Path(path).read_bytes()
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from error
-    head, end, body = data.partition(b"end_header\n")
-    lines = [line.strip() for line in head.decode("ascii", "replace").split("\n")]
-    if not end or lines[0] != "ply" or "format binary_little_endian 1.0" not in lines:
-        raise InputError(f"{path}: expected a PLY with the line 'format binary_little_endian 1.0'")
-    number, names, offset = _header(path, lines)
-    dtype = np.dtype([(name, kind) for name, kind in names])
-    if len(body) < number * dtype.itemsize:
-        raise InputError(f"{path}: expected {number * dtype.itemsize} bytes of vertices, got {len(body)}")
-    table = np.frombuffer(body, dtype, number)
-    rest = sum(name.startswith("f_rest_") for name, _ in names)
+    try:
+        found = read_vertices(data)
+        offset = _offset(found.comments)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from error
+    table, names = found.table, found.table.dtype.names or ()
+    rest = sum(name.startswith("f_rest_") for name in names)
     needed = [name for name in ply_properties(rest // 3) if name not in ("nx", "ny", "nz")]
-    missing = [name for name in needed if name not in (dtype.names or ())]
+    missing = [name for name in needed if name not in names]
     if missing or rest not in (0, 9, 24, 45):
         raise InputError(f"{path}: expected the properties of 3DGS; missing {', '.join(missing) or 'some of f_rest_*'}")
 
     def columns(*wanted: str) -> FloatArray:
-        values = np.stack([table[name] for name in wanted], 1) if wanted else np.zeros((number, 0))
+        values = np.stack([table[name] for name in wanted], 1) if wanted else np.zeros((len(table), 0))
         return np.ascontiguousarray(values, np.float32)
 
     gaussians = Gaussians(
         means=columns("x", "y", "z"),
         quats=columns(*(f"rot_{i}" for i in range(4))),
         scales=columns(*(f"scale_{i}" for i in range(3))),
-        opacities=columns("opacity")[:, 0],
+        opacities=_bounded(path, columns("opacity")[:, 0]),
         sh0=columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None],
-        shN=columns(*(f"f_rest_{i}" for i in range(rest))).reshape(number, 3, rest // 3).transpose(0, 2, 1).copy(),
+        shN=columns(*(f"f_rest_{i}" for i in range(rest))).reshape(len(table), 3, rest // 3).transpose(0, 2, 1).copy(),
     )
+    for name, values in gaussians.items():
+        bad = ~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+        if name == "quats":
+            bad |= ~values.any(1)
+        if bad.any():
+            row = int(bad.argmax())
+            raise InputError(
+                f"{path}: vertex {row}: {name} are {values[row].ravel()[:4].tolist()}, expected finite values"
+                f"{' that are not all zero' if name == 'quats' else ''} ({int(bad.sum())} such vertices)"
+            )
     return gaussians, offset
 
 
-#: Types of properties, as PLY names them.
-_TYPES = {
-    "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1", "char": "i1",
-    "int8": "i1", "ushort": "<u2", "uint16": "<u2", "short": "<i2", "int16": "<i2", "uint": "<u4", "uint32": "<u4",
-    "int": "<i4", "int32": "<i4",
-}  # fmt: skip
+def _bounded(path: str | os.PathLike[str], opacities: FloatArray) -> FloatArray:
+    """Logits of opacity [N], those of exactly 1 and exactly 0 as near to them as any picture shows."""
+    if number := int(np.isinf(opacities).sum()):
+        told = f"{path}: {number} opacities are infinite (opacity of exactly 1 or 0); they are read as {MOST_OPAQUE:g}"
+        warnings.warn(told, stacklevel=3)
+    return np.where(np.isinf(opacities), np.copysign(np.float32(MOST_OPAQUE), opacities), opacities)
 
 
-def _header(
-    path: str | os.PathLike[str], lines: Sequence[str]
-) -> tuple[int, list[tuple[str, str]], tuple[float, float, float]]:
-    """Number of vertices, their properties with types, offset."""
-    number, names, offset = 0, list[tuple[str, str]](), (0.0, 0.0, 0.0)
-    words = [line.split() for line in lines]
-    elements = [word[1:] for word in words if word[:1] == ["element"]]
-    try:
-        if len(elements) != 1 or elements[0][0] != "vertex":
-            raise ValueError("one element, vertex")
-        number = int(elements[0][1])
-        names = [(word[2], _TYPES[word[1]]) for word in words if word[:1] == ["property"]]
-        for word in words:
-            if word[:2] == ["comment", "offset"]:
-                x, y, z = map(float, word[2:])
-                offset = (x, y, z)
-        if number < 0 or len(dict(names)) < len(names):
-            raise ValueError("a number of vertices, and each property once")
-    except (ValueError, KeyError, IndexError) as error:
-        raise InputError(f"{path}: its header is not that of a 3DGS PLY: {error!r}") from error
-    return number, names, offset
+def _offset(comments: Sequence[Sequence[str]]) -> tuple[float, float, float]:
+    """The offset that a comment of ours states, else zeros. Raises ValueError for one that is not three numbers."""
+    stated = next((words[1:] for words in comments if words[:1] == ("offset",)), ("0", "0", "0"))
+    x, y, z = map(float, stated)
+    if not np.isfinite((x, y, z)).all():
+        raise ValueError(f"its header has the offset {x:g} {y:g} {z:g}; expected finite numbers")
+    return x, y, z

@@ -1,6 +1,6 @@
 """Coloured points of frame 0 from files: numpy archives beside cameras.json, and PLY as 3D tools write it.
 
-PLY: ascii or little-endian binary, one row per vertex.
+PLY: ascii or little-endian binary, one row per vertex, colours by their type.
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ import numpy as np
 
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import PointCloud
+from gsstream.core.gaussians import SH0
 from gsstream.core.shapes import BoolArray, FloatArray
+from gsstream.core.vertices import read_vertices
 from gsstream.input.recordings.base import PointKind
 from gsstream.input.recordings.sync import RecordingWarning
 
@@ -24,14 +26,10 @@ TRUSTED = 0.5
 #: Steps of float32 above this share of the points' spread move them visibly.
 COARSE = 1e-3
 
-_TYPES = {
-    "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4", "float": "<f4",
-    "double": "<f8", "int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4",
-    "float32": "<f4", "float64": "<f8",
-}  # fmt: skip
-#: Longest header we read; a file without an end of header is not a PLY.
-_HEADER_LIMIT = 65536
-_MAX_POINTS = 200_000_000
+#: An archive that unpacks to more than this (bytes, and times its own size) describes no points.
+_UNPACKED, _PACKED = 1 << 26, 100
+_CHANNELS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+_SPHERICAL = ("f_dc_0", "f_dc_1", "f_dc_2")
 
 
 def read_points(path: Path, kind: PointKind) -> PointCloud:
@@ -40,6 +38,7 @@ def read_points(path: Path, kind: PointKind) -> PointCloud:
     Raises SourceError naming file and array.
     """
     prefix = "" if kind == "recording" else "sparse_"
+    check_archive(path)
     try:
         with np.load(path, allow_pickle=False) as arrays:
             if not isinstance(arrays, np.lib.npyio.NpzFile):
@@ -91,68 +90,62 @@ def _trusted(path: Path, name: str, trust: FloatArray, count: int) -> BoolArray:
     return kept
 
 
-def read_ply_points(path: Path) -> PointCloud:
-    """Read x, y, z and red, green, blue (uint8; grey 0.5 when absent) of the first element, ``vertex``.
+def check_archive(path: Path) -> None:
+    """Raise SourceError for an archive whose arrays are far larger than the file, before they are unpacked."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size, packed = sum(entry.file_size for entry in archive.infolist()), path.stat().st_size
+    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):
+        return  # whoever reads it says what it is
+    if size > max(_UNPACKED, _PACKED * packed):
+        raise SourceError(
+            f"{path}: {packed} bytes unpack to {size}, more than {_PACKED} times as many: these are no points; write the "
+            "points alone, with numpy.savez"
+        )
 
-    Raises SourceError naming what is wrong: not a PLY, big-endian, no positions, cut short, not finite.
+
+def read_ply_points(path: Path) -> PointCloud:
+    """Read x, y, z and the colours of the element ``vertex``: bytes, 16 bits, floats to 1 or to 255, or harmonics.
+
+    Grey 0.5 where there are none. Raises SourceError naming what is wrong: not a PLY, big-endian, no positions, cut
+    short, not finite, colours of no known range.
     """
     try:
-        data = path.read_bytes()
+        table = read_vertices(path.read_bytes()).table
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error}") from error
-    end = data[:_HEADER_LIMIT].find(b"end_header")
-    if not data.startswith(b"ply") or end < 0:
-        raise SourceError(f"{path}: not a PLY file; expected a header from 'ply' to 'end_header'")
-    body = data.find(b"\n", end) + 1
-    lines = [line.split() for line in data[:end].decode("ascii", "replace").splitlines()]
-    encoding, count, fields = _header(path, lines)
-    table = _table(path, data[body:], encoding, count=count, fields=fields)
-    names = table.dtype.names or ()
+    except ValueError as error:
+        raise SourceError(f"{path}: {error}") from error
+    names = {name.lower(): name for name in table.dtype.names or ()}
     if not {"x", "y", "z"} <= set(names):
         raise SourceError(f"{path}: no x, y, z among the vertex properties {', '.join(names)}")
-    xyz = np.stack([table[axis] for axis in "xyz"], 1).astype(np.float64)
+    xyz = np.stack([table[names[axis]] for axis in "xyz"], 1).astype(np.float64)
     if not np.isfinite(xyz).all():
-        raise SourceError(f"{path}: {int((~np.isfinite(xyz)).any(1).sum())} of {count} points are not finite")
-    if {"red", "green", "blue"} <= set(names):
-        rgb = np.stack([table[channel] for channel in ("red", "green", "blue")], 1).astype(np.float32) / 255
-    else:
-        rgb = np.full(xyz.shape, 0.5, np.float32)
-    return PointCloud(xyz, rgb, path.name)
+        raise SourceError(f"{path}: {int((~np.isfinite(xyz)).any(1).sum())} of {len(xyz)} points are not finite")
+    channels = next((known for known in (*_CHANNELS, _SPHERICAL) if set(known) <= set(names)), None)
+    if channels is None:
+        if others := [name for name in names if name not in ("x", "y", "z", "nx", "ny", "nz")]:
+            told = f"{path}: no colours among the vertex properties {', '.join(others[:12])}; the points are grey"
+            warnings.warn(told, RecordingWarning, stacklevel=2)
+        return PointCloud(xyz, np.full(xyz.shape, 0.5, np.float32), path.name)
+    values = np.stack([table[names[channel]] for channel in channels], 1)
+    if channels is _SPHERICAL:
+        return PointCloud(xyz, np.clip(0.5 + SH0 * values.astype(np.float32), 0, 1), path.name)
+    return PointCloud(xyz, colours(str(path), values), path.name)
 
 
-def _header(path: Path, lines: list[list[str]]) -> tuple[str, int, list[tuple[str, str]]]:
-    encoding, count, fields, element = "", -1, [], ""
-    for words in lines:
-        if words[:1] == ["format"] and len(words) > 1:
-            encoding = words[1]
-        elif words[:1] == ["element"] and len(words) == 3:
-            element = words[1]
-            if element == "vertex" and words[2].isdigit():
-                count = int(words[2])
-            elif count < 0:
-                raise SourceError(f"{path}: the first element is {element!r}; expected 'vertex' and its count")
-        elif words[:1] == ["property"] and element == "vertex":
-            if len(words) != 3 or words[1] not in _TYPES:
-                raise SourceError(f"{path}: vertex property {' '.join(words[1:])!r} is not a plain number")
-            fields.append((words[2], _TYPES[words[1]]))
-    if encoding not in ("ascii", "binary_little_endian"):
-        raise SourceError(f"{path}: format {encoding!r}; expected ascii or binary_little_endian")
-    if not 0 <= count <= _MAX_POINTS or not fields or len({name for name, _ in fields}) < len(fields):
-        raise SourceError(f"{path}: expected one 'element vertex COUNT' with differently named properties")
-    return encoding, count, fields
+def colours(where: str, values: np.ndarray) -> FloatArray:
+    """Return colours [P, 3] as float32 in [0, 1], by their type and their range.
 
-
-def _table(path: Path, body: bytes, encoding: str, count: int, fields: list[tuple[str, str]]) -> np.ndarray:
-    dtype = np.dtype(fields)
-    if encoding == "binary_little_endian":
-        if len(body) < count * dtype.itemsize:
-            raise SourceError(f"{path}: cut short: {count} points need {count * dtype.itemsize} bytes, got {len(body)}")
-        return np.frombuffer(body, dtype, count)
-    rows = body.decode("ascii", "replace").splitlines()[:count]
-    try:
-        if len(rows) < count:
-            raise ValueError(f"{count} rows are announced, {len(rows)} are there")
-        numbers = [tuple(float(word) for word in row.split()) for row in rows]
-        return np.array(numbers, dtype=[(name, "<f8") for name, _ in fields])
-    except ValueError as error:
-        raise SourceError(f"{path}: the rows cannot be read: {error}") from error
+    Bytes and whole numbers to 255 are divided by 255, other whole numbers by 65535; floats are taken as they are up to
+    1, else divided by 255. Raises SourceError for any other range.
+    """
+    if not len(values):
+        return np.zeros((0, 3), np.float32)
+    low, high, whole = float(values.min()), float(values.max()), values.dtype.kind in "iu"
+    most = next((bound for bound in ((255.0, 65535.0) if whole else (1.0, 255.0)) if high <= bound), 0.0)
+    if not low >= 0 or not 0 <= high <= most:
+        kind = "whole numbers to 255 or 65535" if whole else "numbers to 1 or 255"
+        raise SourceError(f"{where}: colours of the type {values.dtype} from {low:g} to {high:g}; expected {kind}")
+    out: FloatArray = values.astype(np.float32) / np.float32(most)
+    return out

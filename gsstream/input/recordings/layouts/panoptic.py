@@ -18,6 +18,7 @@ from gsstream.core.errors import SourceError
 from gsstream.core.frame import PointCloud
 from gsstream.input.recordings.calibration import read_json
 from gsstream.input.recordings.clips import Clip, ImageClip
+from gsstream.input.recordings.pointfiles import check_archive, colours
 from gsstream.input.recordings.recorded import Recording, SeenPoints
 
 TRAIN, TEST, IMAGES, POINTS = "train_meta.json", "test_meta.json", "ims", "init_pt_cld.npz"
@@ -125,6 +126,7 @@ def _matrices(path: Path, meta: dict[str, Any], key: str, cameras: int, side: in
 def _points(path: Path, cameras: int) -> SeenPoints | None:
     if not path.is_file():
         return None
+    check_archive(path)
     try:
         with np.load(path, allow_pickle=False) as arrays:
             data = arrays["data"]
@@ -132,5 +134,5 @@ def _points(path: Path, cameras: int) -> SeenPoints | None:
         raise SourceError(f"{path}: expected a numpy archive with an array 'data': {error}") from error
     if data.ndim != 2 or data.shape[1] not in (6, 7) or not np.isfinite(data).all():
         raise SourceError(f"{path}: expected 'data' [P, 7] of finite numbers, got {list(data.shape)}")
-    cloud = PointCloud(data[:, :3].astype(np.float64), data[:, 3:6].astype(np.float32), path.name)
+    cloud = PointCloud(data[:, :3].astype(np.float64), colours(str(path), data[:, 3:6]), path.name)
     return SeenPoints(cloud, np.zeros((len(cloud), cameras), bool))

@@ -99,8 +99,8 @@ def check_archive(path: Path) -> None:
         return  # whoever reads it says what it is
     if size > max(_UNPACKED, _PACKED * packed):
         raise SourceError(
-            f"{path}: {packed} bytes unpack to {size}, more than {_PACKED} times as many: these are no points; write the "
-            "points alone, with numpy.savez"
+            f"{path}: {packed} bytes unpack to {size}, more than {_PACKED} times as many: these are no points; "
+            "write the points alone, with numpy.savez"
         )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -17,13 +16,14 @@ from gsstream.core.install_hints import page
 from gsstream.core.names import check_camera_ids
 from gsstream.input.recordings.base import Split
 from gsstream.input.recordings.clips import VIDEO_SUFFIXES, prepare_command
+from gsstream.input.recordings.foreign import MAX_NUMBER, MAX_SIDE, brief, matrix
 from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.rigs.camera import opencv_lens
 
 SCHEMA = "opencv-multiview-1"
 #: Largest picture side, number of frames, and lengths of a text and of a pattern that a file may state. They are
 #: checked before any memory is allocated and any file is opened.
-MAX_SIDE, MAX_FRAMES, MAX_TEXT, MAX_PATTERN = 1 << 16, 10_000_000, 1 << 20, 1000
+MAX_FRAMES, MAX_TEXT, MAX_PATTERN = 10_000_000, 1 << 20, 1000
 CALIBRATION_FILE = "cameras.json"
 
 
@@ -60,7 +60,7 @@ def read_calibration(folder: Path, *, growing: bool = False, any_sizes: bool = F
     data = _load_json(path)
     cameras = data.get("cameras")
     if not isinstance(cameras, list) or not cameras or not all(isinstance(c, dict) for c in cameras):
-        raise SourceError(f"{path}: 'cameras' must be a non-empty list of objects, got {_brief(cameras)}")
+        raise SourceError(f"{path}: 'cameras' must be a non-empty list of objects, got {brief(cameras)}")
     ids = [_camera_id(path, camera, index) for index, camera in enumerate(cameras)]
     if len(set(ids)) != len(ids):
         twice = sorted({i for i in ids if ids.count(i) > 1})
@@ -119,7 +119,7 @@ def _load_json(path: Path) -> dict[str, Any]:
 def _shown(data: Any) -> str:
     if not isinstance(data, dict):
         return f"a {type(data).__name__}"
-    return f'"schema": {_brief(data["schema"])}' if "schema" in data else f"the keys {_brief(sorted(data))}"
+    return f'"schema": {brief(data["schema"])}' if "schema" in data else f"the keys {brief(sorted(data))}"
 
 
 def _rig(path: Path, cameras: list[dict[str, Any]], sizes: dict[str, tuple[int, int]], any_sizes: bool) -> Cameras:
@@ -146,7 +146,7 @@ def _rig(path: Path, cameras: list[dict[str, Any]], sizes: dict[str, tuple[int, 
 
 def _splits(path: Path, ids: list[str], cameras: list[dict[str, Any]], named: Any) -> list[Split]:
     if named is not None and not (isinstance(named, list) and all(isinstance(name, str) for name in named)):
-        raise SourceError(f"{path}: 'test_cameras' must be a list of camera ids, got {_brief(named)}")
+        raise SourceError(f"{path}: 'test_cameras' must be a list of camera ids, got {brief(named)}")
     test = set(named or [])
     if unknown := sorted(str(t) for t in test - set(ids)):
         names = ", ".join(map(repr, unknown))
@@ -167,7 +167,7 @@ def _splits(path: Path, ids: list[str], cameras: list[dict[str, Any]], named: An
 def _camera_id(path: Path, camera: dict[str, Any], index: int) -> str:
     camera_id = camera.get("id")
     if not isinstance(camera_id, str) or not camera_id:
-        raise SourceError(f"{path}: camera number {index} needs a non-empty text 'id', got {_brief(camera_id)}")
+        raise SourceError(f"{path}: camera number {index} needs a non-empty text 'id', got {brief(camera_id)}")
     try:
         check_camera_ids([camera_id])
     except ShapeError as error:
@@ -181,7 +181,7 @@ def _size(path: Path, camera_id: str, camera: dict[str, Any]) -> tuple[int, int]
         return width, height
     raise SourceError(
         f"{path}: camera {camera_id!r}: width and height must be positive whole pixels up to {MAX_SIDE}, got "
-        f"{_brief(width)} x {_brief(height)}"
+        f"{brief(width)} x {brief(height)}"
     )
 
 
@@ -189,26 +189,18 @@ def _matrix(path: Path, camera_id: str, camera: dict[str, Any], key: str, side: 
     if key not in camera:
         what = "intrinsics in pixels" if key == "K" else "world to camera, OpenCV axes"
         raise SourceError(f"{path}: camera {camera_id!r} has no {key!r}; give the {side} x {side} matrix ({what})")
-    try:
-        matrix = np.asarray(camera.get(key), dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise SourceError(f"{path}: camera {camera_id!r}: {key} is not a matrix of numbers ({error})") from error
-    if matrix.shape != (side, side):
-        raise SourceError(
-            f"{path}: camera {camera_id!r}: {key} must be a {side} x {side} matrix, got shape {list(matrix.shape)}"
-        )
-    return matrix
+    return matrix(f"{path}: camera {camera_id!r}", key, camera[key], (side, side))
 
 
 def _lens(path: Path, camera_id: str, camera: dict[str, Any]) -> Lens:
     values, fisheye, where = camera.get("distortion", []), camera.get("fisheye", False), f"{path}: camera {camera_id!r}"
-    numbers = isinstance(values, list) and all(isinstance(v, int | float) and math.isfinite(v) for v in values)
+    numbers = isinstance(values, list) and all(type(v) in (int, float) and abs(v) < MAX_NUMBER for v in values)
     if not numbers or not isinstance(fisheye, bool):
         raise SourceError(
             f"{where}: 'distortion' must be a list of numbers (k1, k2, p1, p2, k3, ... as OpenCV has them) and "
-            f"'fisheye' true or false, got {_brief(values)} and {_brief(fisheye)}"
+            f"'fisheye' true or false, got {brief(values)} and {brief(fisheye)}"
         )
-    return opencv_lens(values, fisheye, f"{where}: distortion")
+    return opencv_lens(list(map(float, values)), fisheye, f"{where}: distortion")
 
 
 def _pattern(path: Path, camera_id: str, camera: dict[str, Any]) -> str:
@@ -219,7 +211,7 @@ def _pattern(path: Path, camera_id: str, camera: dict[str, Any]) -> str:
             f'"{camera_id}/%06d.png", or as the path of a video'
         )
     if len(pattern) > MAX_PATTERN or re.search(r"%[^a-zA-Z]*\d{3}", pattern):
-        raise SourceError(f"{path}: camera {camera_id!r}: 'frames' {_brief(pattern)} is longer than a path can be")
+        raise SourceError(f"{path}: camera {camera_id!r}: 'frames' {brief(pattern)} is longer than a path can be")
     try:
         example = frame_path(pattern, 0)
     except (TypeError, ValueError) as error:
@@ -245,7 +237,7 @@ def frame_path(pattern: str, index: int) -> str:
 def _count(path: Path, frames: Any) -> int:
     if type(frames) is not int or not 1 <= frames <= MAX_FRAMES:
         raise SourceError(
-            f"{path}: 'frames' must be the number of frames, at least 1 and at most {MAX_FRAMES}, got {_brief(frames)}"
+            f"{path}: 'frames' must be the number of frames, at least 1 and at most {MAX_FRAMES}, got {brief(frames)}"
         )
     return frames
 
@@ -263,12 +255,5 @@ def _text(path: Path, key: str, value: Any, most: int) -> str:
 
 def _positive(path: Path, key: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 1e6:
-        raise SourceError(f"{path}: {key!r} must be a positive number below a million, got {_brief(value)}")
+        raise SourceError(f"{path}: {key!r} must be a positive number below a million, got {brief(value)}")
     return float(value)
-
-
-def _brief(value: Any) -> str:
-    if isinstance(value, int) and abs(value) >= 10**60:
-        return "a number of more than 60 digits"
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

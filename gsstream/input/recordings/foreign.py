@@ -10,6 +10,7 @@ import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,8 @@ from gsstream.input.recordings.sync import RecordingWarning
 
 #: Pictures with a longer side do not exist.
 MAX_SIDE = 1 << 16
+#: Larger numbers overflow as soon as they are used.
+MAX_NUMBER = 1e300
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +98,7 @@ def number(
     where: str, key: str, value: Any, *, above: float = -math.inf, below: float = math.inf, expected: str = ""
 ) -> float:
     """Return a finite number between bounds that are left out. Raises SourceError for anything else, texts included."""
-    good = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+    good = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < MAX_NUMBER
     if not good or not above < value < below:
         expected = expected or ("a positive number" if above == 0 else "a finite number")
         raise SourceError(f"{where}: {key} must be {expected}, got {brief(value)}")
@@ -137,6 +140,19 @@ def parsed(where: str, key: str, words: Sequence[Any], *counts: int) -> FloatArr
         expected = f"{' or '.join(map(str, counts))} finite numbers" if counts else "finite numbers"
         raise SourceError(f"{where}: {key} must hold {expected}, got {brief(list(words))}")
     return values
+
+
+def inside(where: str, name: str) -> str:
+    """Return a relative path as POSIX writes it: files made on Windows have backslashes, others begin with ./.
+
+    Raises SourceError for a path that leaves its folder, and for a text that can be no path.
+    """
+    path = PurePosixPath(name.replace("\\", "/"))
+    if path.is_absolute() or ".." in path.parts or ":" in path.parts[:1]:
+        raise SourceError(f"{where}: {name!r} must stay inside the folder")
+    if "\0" in name or any(len(part.encode("utf-8", "replace")) > 255 for part in path.parts) or len(name) > 2000:
+        raise SourceError(f"{where}: {brief(name)} cannot be a path")
+    return str(path)
 
 
 def brief(value: Any) -> str:

@@ -18,7 +18,7 @@ from gsstream.core.errors import SourceError
 from gsstream.core.frame import PointCloud
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, images_in, natural_sort_key
-from gsstream.input.recordings.foreign import left_out, warn
+from gsstream.input.recordings.foreign import inside, left_out, warn
 from gsstream.input.recordings.layouts.colmap_model import (
     ModelImage,
     has_model,
@@ -107,9 +107,7 @@ def _unit(model: Path, image: ModelImage) -> FloatArray:
 
 
 def _names(model: Path, files: list[str]) -> list[str]:
-    paths = [PurePosixPath(name) for name in files]
-    if bad := [p for p in paths if p.is_absolute() or ".." in p.parts]:
-        raise SourceError(f"{model}: image {str(bad[0])!r} must stay inside images/")
+    paths = [PurePosixPath(inside(f"{model}: image", name)) for name in files]
     folders, stems = [p.parent.name for p in paths], [p.stem for p in paths]
     if all(folders) and len(set(folders)) == len(paths):
         return folders
@@ -132,7 +130,7 @@ def _clip(folder: Path, name: str, image: str) -> Clip | None:
                 from gsstream.input.recordings.video import VideoClip
 
                 return VideoClip(path)
-    path = folder / "images" / image
+    path = folder / "images" / inside(str(folder), image)
     return ImageClip([path]) if path.is_file() else None
 
 

@@ -237,5 +237,5 @@ class _parsing:  # noqa: N801 reads as a statement
         return None
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, (ValueError, IndexError)) and not isinstance(error, SourceError):
+        if isinstance(error, (ValueError, IndexError, OverflowError)) and not isinstance(error, SourceError):
             raise SourceError(f"{self._path}:{self._line}: not a line of this file: {error}") from error

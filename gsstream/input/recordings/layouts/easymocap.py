@@ -16,7 +16,7 @@ import numpy as np
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, folder_clip, images_in
-from gsstream.input.recordings.foreign import Keys, check_keys, left_out, parsed, pixels
+from gsstream.input.recordings.foreign import Keys, check_keys, inside, left_out, parsed, pixels
 from gsstream.input.recordings.poses import from_pixel_centers, from_rotation_vector
 from gsstream.input.recordings.recorded import Recording
 from gsstream.input.recordings.rigs.camera import RigCamera, assembled_rig, opencv_lens
@@ -40,10 +40,12 @@ def read(folder: Path) -> Recording:
     names = intri.get("names")
     if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
         raise SourceError(f"{path}: 'names' must list the cameras")
+    for name in names:
+        inside(f"{path}: names", name)
     check_keys(str(path), [intri], _INTRI)
     check_keys(str(folder / EXTRINSICS), [extri], _EXTRI)
-    inside = [p.name for p in (folder / "images").glob("*") if images_in(p)]
-    clips = {n: clip for n in sorted({*names, *inside}) if (clip := _clip_of(folder, n)) is not None}
+    there = [p.name for p in (folder / "images").glob("*") if images_in(p)]
+    clips = {n: clip for n in sorted({*names, *there}) if (clip := _clip_of(folder, n)) is not None}
     if not clips:
         raise SourceError(f"{folder}: no pictures of any camera; expected images/NAME/000000.jpg or videos/NAME.mp4")
     cameras = {name: _camera(folder, intri, extri, name=name, pictures=clip.size) for name, clip in clips.items()}

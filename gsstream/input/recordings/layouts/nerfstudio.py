@@ -24,7 +24,7 @@ from gsstream.core.errors import SourceError, suggest
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.calibration import read_json
 from gsstream.input.recordings.clips import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Clip, ImageClip, folder_clip
-from gsstream.input.recordings.foreign import Keys, check_keys, left_out, matrix, number, pixels, warn
+from gsstream.input.recordings.foreign import Keys, check_keys, inside, left_out, matrix, number, pixels, warn
 from gsstream.input.recordings.layouts.nerfstudio_groups import INTRINSICS, group_entries
 from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.pointfiles import read_ply_points
@@ -171,18 +171,11 @@ def _load(path: Path) -> dict[str, Any]:
         name = entry.get("file_path")
         if not isinstance(name, str) or not name:
             raise SourceError(f"{path}: frame {place} has no 'file_path'")
-        entry["file_path"] = _plain(name)
-        if PurePosixPath(entry["file_path"]).is_absolute() or ".." in PurePosixPath(entry["file_path"]).parts:
-            raise SourceError(f"{path}: file_path {name!r} must stay inside the folder")
+        entry["file_path"] = inside(f"{path}: file_path", name)
         if "time" in entry:
             number(str(path), f"time of {name!r}", entry["time"])
     check_keys(str(path), (known, *frames), _KEYS)
     return {**known, "frames": frames}
-
-
-def _plain(name: str) -> str:
-    """A path as POSIX writes it: files made on Windows have backslashes, others begin with ./."""
-    return str(PurePosixPath(name.replace("\\", "/")))
 
 
 def _present(
@@ -233,7 +226,8 @@ def _listed(path: Path, data: dict[str, Any], key: str) -> set[str] | None:
     files = [entry["file_path"] for entry in data["frames"]]
     # Loosely: in another case, without a suffix.
     known = {_loose(name): name for name in files} | {name: name for name in files}
-    found = {name: known.get(_plain(name), known.get(_loose(_plain(name)))) for name in names}
+    plain = {name: inside(f"{path}: {key}", name) for name in names}
+    found = {name: known.get(file, known.get(_loose(file))) for name, file in plain.items()}
     if unknown := [name for name, entry in found.items() if entry is None]:
         raise SourceError(
             f"{path}: {key}: {unknown[0]!r} is no file_path of an entry{suggest(unknown[0], files[:100])}"

@@ -18,10 +18,14 @@ from gsstream.core.errors import SourceError
 from gsstream.core.frame import PointCloud
 from gsstream.input.recordings.calibration import read_json
 from gsstream.input.recordings.clips import Clip, ImageClip
+from gsstream.input.recordings.foreign import Keys, check_keys, inside, matrix, pixels
 from gsstream.input.recordings.pointfiles import check_archive, colours
 from gsstream.input.recordings.recorded import Recording, SeenPoints
 
 TRAIN, TEST, IMAGES, POINTS = "train_meta.json", "test_meta.json", "ims", "init_pt_cld.npz"
+
+#: As Dynamic 3D Gaussians writes it.
+_KEYS = Keys(read=("w", "h", "k", "w2c", "fn", "cam_id"), idle=("near", "far"), refused=("dist", "distCoef", "fisheye"))
 
 
 def looks_like(folder: Path) -> bool:
@@ -41,7 +45,7 @@ def read(folder: Path) -> Recording:
         if name == TEST and not path.is_file():
             continue
         meta = _load(path)
-        sizes.add((_whole(path, meta, "w"), _whole(path, meta, "h")))
+        sizes.add((pixels(str(path), "w", meta["w"]), pixels(str(path), "h", meta["h"])))
         names = [f"cam{number}" for number in _fixed(path, meta, "cam_id")]
         files = _files(path, meta, len(names))
         for c, camera in enumerate(names):
@@ -70,13 +74,8 @@ def _load(path: Path) -> dict[str, Any]:
     known = read_json(path)
     if missing := [key for key in ("w", "h", "k", "w2c", "fn", "cam_id") if key not in known]:
         raise SourceError(f"{path}: expected the keys w, h, k, w2c, fn, cam_id; missing: {', '.join(missing)}")
+    check_keys(str(path), [known], _KEYS)
     return known
-
-
-def _whole(path: Path, meta: dict[str, Any], key: str) -> int:
-    if type(meta[key]) is not int or meta[key] < 1:
-        raise SourceError(f"{path}: {key!r} must be a positive number of pixels, got {meta[key]!r}")
-    return int(meta[key])
 
 
 def _fixed(path: Path, meta: dict[str, Any], key: str) -> list[Any]:
@@ -84,6 +83,8 @@ def _fixed(path: Path, meta: dict[str, Any], key: str) -> list[Any]:
     rows = meta[key]
     if not isinstance(rows, list) or not rows or not isinstance(rows[0], list) or not rows[0]:
         raise SourceError(f"{path}: {key!r} must be a list per instant of lists per camera")
+    if not all(type(cell) in (int, str) for cell in rows[0]):
+        raise SourceError(f"{path}: {key!r} must hold whole numbers or names, got {rows[0]!r:.60}")
     for t, row in enumerate(rows):
         if row != rows[0]:
             raise SourceError(f"{path}: {key!r} of instant {t} differs from instant 0; cameras must stay the same")
@@ -98,21 +99,11 @@ def _files(path: Path, meta: dict[str, Any], cameras: int) -> list[list[str]]:
     )
     if not good or len(rows) != len(meta["cam_id"]):
         raise SourceError(f"{path}: 'fn' must name one picture per instant and camera ({cameras} cameras)")
-    for name in rows[0]:
-        if Path(name).is_absolute() or ".." in Path(name).parts:
-            raise SourceError(f"{path}: picture {name!r} must stay inside {IMAGES}/")
-    return rows
+    return [[inside(f"{path}: picture", name) for name in row] for row in rows]
 
 
 def _matrices(path: Path, meta: dict[str, Any], key: str, cameras: int, side: int) -> np.ndarray[Any, Any]:
-    try:
-        values = np.asarray(meta[key], np.float64)
-    except (TypeError, ValueError) as error:
-        raise SourceError(f"{path}: {key!r} is not an array of numbers ({error})") from error
-    if values.shape[1:] != (cameras, side, side) or len(values) == 0:
-        raise SourceError(
-            f"{path}: {key!r} must be [instants, {cameras} cameras, {side}, {side}], got {list(values.shape)}"
-        )
+    values = matrix(str(path), key, meta[key], (len(meta["fn"]), cameras, side, side))
     moved = ~(np.abs(values - values[:1]).max((1, 2, 3)) <= 1e-6 * np.abs(values[0]).max())
     if moved.any():
         raise SourceError(

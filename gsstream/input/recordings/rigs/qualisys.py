@@ -13,12 +13,20 @@ from xml.etree import ElementTree
 import numpy as np
 
 from gsstream.core.errors import SourceError
+from gsstream.input.recordings.foreign import Keys, check_keys, parsed, pixels
 from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.poses import OPENGL_TO_OPENCV, from_pixel_centers
 from gsstream.input.recordings.rigs.camera import RigCamera
 
 SUFFIXES = (".txt", ".xml")
 UNIT = 1 / 64
+#: Attributes of ``intrinsic``; those of the sensor and the lens in millimetres say nothing of pixels.
+_KEYS = Keys(
+    read=("focalLengthU", "focalLengthV", "centerPointU", "centerPointV", "radialDistortion1", "radialDistortion2",
+          "radialDistortion3", "tangentalDistortion1", "tangentalDistortion2"),
+    idle=("focallength", "sensorMinU", "sensorMaxU", "sensorMinV", "sensorMaxV"),
+    refused=("skew", "radialDistortion4", "radialDistortion5", "radialDistortion6"),
+)  # fmt: skip
 
 
 def read(path: Path, text: str) -> list[RigCamera]:
@@ -41,8 +49,9 @@ def _camera(path: Path, entry: ElementTree.Element) -> RigCamera:
         raise SourceError(f"{path}: camera {name!r} needs transform, intrinsic and fov_video")
 
     def number(of: ElementTree.Element, key: str) -> float:
-        return float(of.attrib[key])
+        return float(parsed(f"{path}: camera {name!r}", key, [of.attrib[key]], 1)[0])
 
+    check_keys(f"{path}: camera {name!r}", [lens.attrib], _KEYS)
     w2c = np.eye(4)
     w2c[:3, :3] = [[number(pose, f"r{row}{column}") for column in (1, 2, 3)] for row in (1, 2, 3)]
     w2c[:3, 3] = -w2c[:3, :3] @ [number(pose, axis) for axis in "xyz"]
@@ -51,7 +60,8 @@ def _camera(path: Path, entry: ElementTree.Element) -> RigCamera:
     radial = [number(lens, f"radialDistortion{i}") for i in (1, 2, 3)]
     p1, p2 = (number(lens, f"tangentalDistortion{i}") for i in (1, 2))  # the format's own spelling
     K = np.array([[fx, 0, cx - left], [0, fy, cy - top], [0, 0, 1.0]])
-    size = right - left + 1, bottom - top + 1
+    where = f"{path}: camera {name!r}: fov_video"
+    size = pixels(where, "width", right - left + 1), pixels(where, "height", bottom - top + 1)
     return RigCamera(
         name=name,
         w2c=OPENGL_TO_OPENCV @ w2c,

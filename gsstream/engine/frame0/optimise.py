@@ -109,13 +109,12 @@ def optimise_first_frame(
     settings = assembly.recipe.first_frame
     iterations = min(settings.epochs * len(frame.cameras), settings.max_iterations)
     pyramid = plan_pyramid(frame.cameras.width, iterations, settings)
-    # The name of this random stream is that of older versions, so that a seed still gives the same frame 0.
     run = FirstFrameRun(
         start=start,
         levels=levels,
         frame=frame,
         assembly=assembly,
-        generator=rng.stream("root", frame.index),
+        generator=rng.stream("first frame", frame.index),
         pyramid=pyramid,
     )
     run.exposure = ExposureFit.start(len(frame.cameras), run.device) if settings.exposure else None
@@ -288,7 +287,7 @@ class FirstFrameRun:
     def _next_view(self) -> int:
         if not self.order:
             self.order = torch.randperm(self.views, generator=self.generator).tolist()
-        return self.order.pop()
+        return self.order.pop(0)
 
 
 def sort_by_node(node_of: torch.Tensor) -> TopologyEdit:

@@ -50,8 +50,7 @@ def optimise(assembly: Assembly, problem: Problem, schedule: EpochScheduler) -> 
         return Solution(problem.rows.cpu(), {}, {}, problem.logits.cpu())
     fit, losses = _Fit(assembly, problem, schedule), list[torch.Tensor]()
     while schedule.goes_on and len(fit.rows):
-        # Reversed, because older versions took views from the end of the list: so equal seeds still give equal bytes.
-        order = torch.randperm(len(problem.cameras), generator=problem.generator).tolist()[::-1]
+        order = torch.randperm(len(problem.cameras), generator=problem.generator).tolist()
         losses = [loss for views in schedule.next_pass(order) for loss in fit.run(views)]
         if not schedule.is_cut:
             fit.end_pass()

@@ -68,9 +68,9 @@ def _layouts() -> Iterator[Vector]:
     layouts = {
         "layout-cut": (b"\6\0\0\0\3\0\0\0", "1.3-6"),
         "layout-units-cut": (struct.pack("<IIBf", 6, 3, 2, 1.0), "1.3-6"),
-        "layout-rows-beyond-the-packet": (laid(70000, 3, (1.0,), counts, units), "3.5-1 1.8-1"),
+        "layout-rows-beyond-the-packet": (laid(200_000, 3, (1.0,), counts, units), "3.5-1 1.8-1"),
         "layout-most-rows": (laid(many, 3, (1.0,), counts, units), "3.5-1 1.8-1"),
-        "layout-nodes-beyond-the-packet": (laid(6, 70000, (1.0,), counts, units), "3.5-1 1.8-1"),
+        "layout-nodes-beyond-the-packet": (laid(6, 200_000, (1.0,), counts, units), "3.5-1 1.8-1"),
         "layout-most-nodes": (laid(6, many, (1.0,), counts, units), "3.5-1 1.8-1"),
         "layout-65-units": (laid(6, 3, (1.0,) * 65, counts, units), "3.5-2"),
         "layout-unit-0": (laid(6, 3, (1.0, 0.0), counts, units), "3.5-3"),

@@ -41,7 +41,7 @@ OPTIONS = {
     ],
     "gsstream scene": [],
     "gsstream scene prepare": [
-        "RAW", "--out", "--test", "--lens", "--each", "--frames", "--width", "--fps", "--quiet",
+        "RAW", "--out", "--test", "--lens", "--each", "--frames", "--width", "--without", "--fps", "--quiet",
     ],
     "gsstream scene validate": ["SCENE", "--frames", "--no-features"],
     "gsstream play": ["STREAM", "--out", "--camera", "--frames", "--fps", "--size", "--renderer", "--max-memory"],
@@ -157,7 +157,7 @@ def run(capsys: pytest.CaptureFixture[str], *args: str) -> tuple[int, str, str]:
     ("args", "message"),
     [
         ([*RUN, "--method", "dens"], "no method named 'dens'; did you mean 'dense'?"),
-        ([*RUN, "--set", "lss.backend=1"], "--set lss.backend=1: unknown key 'lss'; did you mean 'loss'?"),
+        ([*RUN, "--set", "rendrer=cpu"], "--set rendrer=cpu: unknown key 'rendrer'; did you mean 'renderer'?"),
         ([*SLOW, "--set", "gate=always-opne"], "--set gate=always-opne: gate.name: no gate named 'always-opne'; did"),
         ([*RUN, "--set", "renderer=referense"], "--set renderer=referense: renderer.name: no renderer named 'referen"),
         ([*SLOW, "--set", "gate.temperatur=1"], "--set gate.temperatur=1: unknown key 'gate.params.temperatur'; none"),

@@ -52,7 +52,7 @@ EAGER: dict[str, list[dict[str, Any]]] = {
 #: Part of a slot -> settings, beside the default, of which each changes what it does.
 OTHERWISE: dict[tuple[str, str], list[dict[str, Any]]] = {
     ("gate", "binary-ste"): [{"noise": "none"}, {"temperature": 2.0}, {"clamp_gradient": True}],
-    ("motion", "keypoints"): [{"epochs": 1, "keypoints": 20, "step": 0.02}],
+    ("motion", "keypoints"): [{"keypoints": 20, "step": 0.02}],
     ("motion", "hicom"): [{"epochs": 1, "measure": "cell", "step": 0.02}, {"momentum": 0.0}],
     ("motion", "recon"): [ANCHORS, {**ANCHORS, "rounded": True}, {"every": 1}, {"momentum": 0.0}],
     ("motion", "stream3dgs"): [CACHE, {**CACHE, "sent": "cells"}],

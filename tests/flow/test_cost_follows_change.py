@@ -37,6 +37,9 @@ def test_threshold_zero_is_the_dense_path(tmp_path: Path, monkeypatch: pytest.Mo
     class Plain(ScatterSession):
         """Renders everything every time; only the gradient of the 2-D means is the native session's own."""
 
+        def fused_views(self, *_: object) -> None:
+            """Iterations are made one by one."""
+
         def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
             native = opened(self._renderer, self._gaussians, None, self._cameras, self._background)
             return native.screen_gradient(view, image_gradient)

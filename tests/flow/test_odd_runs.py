@@ -61,7 +61,9 @@ def test_a_disturbed_run_is_evaluated_on_what_it_saw(tmp_path: Path, capsys: pyt
     encode(tmp_path / "whole", source=source, method="s2gs-edge", data__train_views=2)
     assert len(metrics(tmp_path / "whole")) == 4  # the offset costs one frame
     capsys.readouterr()
-    assert run_command(["evaluate", str(tmp_path / "whole")]) == 0
+    assert run_command(["evaluate", str(tmp_path / "whole")]) == 2, "a source of a plugin is opened when it is named"
+    assert "name it yourself with --source" in capsys.readouterr().err
+    assert run_command(["evaluate", str(tmp_path / "whole"), "--source", source]) == 0
     mean = sum(next(iter(line["psnr"].values())) for line in metrics(tmp_path / "whole")[1:]) / 3
     assert f"{mean:.2f}" in capsys.readouterr().out
 

@@ -44,7 +44,8 @@ def play(path: Path, data: bytes, base: Base) -> str:
     sound = sum(end <= same for end in base.ends)  # frames that the damage cannot have touched
     seen, error = 0, None
     try:
-        with Playback(path) as playback:
+        # Refused for its memory, a stream says nothing of its format, and another machine refuses others.
+        with Playback(path, max_memory=1 << 62) as playback:
             first = playback.frames[0]
             for frame, scene in playback:
                 _check(scene, base.scenes[seen] if seen < sound else None, frame)

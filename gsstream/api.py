@@ -69,5 +69,4 @@ from gsstream.parts.residual.layout import AttributeCode as AttributeCode
 from gsstream.parts.structure.base import Anchors as Anchors
 from gsstream.parts.structure.base import Structure as Structure
 from gsstream.parts.structure.base import StructureTraits as StructureTraits
-from gsstream.parts.update.base import Scope as Scope
 from gsstream.parts.update.base import UpdateRule as UpdateRule

@@ -16,11 +16,9 @@ from gsstream.engine.fit.nearest import k_nearest as k_nearest
 from gsstream.engine.fit.nearest import nearest_rows as nearest_rows
 from gsstream.engine.fit.nearest import neighbour_distance as neighbour_distance
 from gsstream.parts.backend.change import count_per_tile as count_per_tile
-from gsstream.parts.growth.copying import CopyFilter as CopyFilter
 from gsstream.parts.growth.copying import CopySettings as CopySettings
 from gsstream.parts.growth.copying import least_opaque as least_opaque
 from gsstream.parts.growth.copying import replace_with_copies as replace_with_copies
-from gsstream.parts.growth.fitting import concat_gaussians as concat_gaussians
 from gsstream.parts.growth.fitting import fit_added as fit_added
 from gsstream.parts.motion.field import approximate_by_cells as approximate_by_cells
 from gsstream.parts.motion.field import rounded_motion as rounded_motion

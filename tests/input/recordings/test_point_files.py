@@ -70,9 +70,18 @@ def test_colours_by_other_names_and_harmonics_are_read_and_others_are_said(tmp_p
 
 @pytest.mark.parametrize(
     ("kind", "colour"),
-    [("float", "nan 0 0"), ("float", "-0.1 0 0"), ("float", "256 0 0"), ("int", "65536 0 0"), ("int", "-1 0 0"),
-     ("float", "inf 0 0"), ("uchar", "256 0 0"), ("uchar", "0.5 0 0"), ("uchar", "nan 0 0")],
-)  # fmt: skip
+    [
+        ("float", "nan 0 0"),
+        ("float", "-0.1 0 0"),
+        ("float", "256 0 0"),
+        ("int", "65536 0 0"),
+        ("int", "-1 0 0"),
+        ("float", "inf 0 0"),
+        ("uchar", "256 0 0"),
+        ("uchar", "0.5 0 0"),
+        ("uchar", "nan 0 0"),
+    ],
+)
 def test_colours_of_no_known_range_are_refused(tmp_path: Path, kind: str, colour: str) -> None:
     with pytest.raises(SourceError, match=r"a\.ply: (colours of the type|the rows cannot be read: vertex 0)"):
         read_ply_points(text(tmp_path / "a.ply", kind, colour))

@@ -134,9 +134,9 @@ def find_change(before: Sequence[torch.Tensor], now: Sequence[torch.Tensor], thr
         before, now: one image [H, W, 3] per view, float32, or uint8 of which 255 is 1.0.
         threshold: multiple of the noise of block means.
     """
-    tiles = [changed_tiles(changed_blocks(*pair, threshold)) for pair in zip(before, now, strict=True)]
+    blocks = [changed_blocks(*pair, threshold) for pair in zip(before, now, strict=True)]
     height, width = now[0].shape[:2]
-    return Change(torch.stack(tiles), height, width)
+    return Change(changed_tiles(torch.stack(blocks)), height, width)
 
 
 def changed_blocks(before: torch.Tensor, now: torch.Tensor, threshold: float) -> torch.Tensor:
@@ -195,20 +195,24 @@ def block_sigma(means: torch.Tensor) -> torch.Tensor:
 
 
 def changed_tiles(blocks: torch.Tensor) -> torch.Tensor:
-    """Return [ceil(H / 16), ceil(W / 16)] bool of one view, of its blocks that changed."""
+    """Return [V, ceil(H / 16), ceil(W / 16)] bool, of the blocks [V, ceil(H / 4), ceil(W / 4)] that changed."""
     count, number = count_per_tile(blocks, TILE // ChangeRule.BLOCK)
     return count >= number.clamp_max(ChangeRule.MIN_BLOCKS)
 
 
 def count_per_tile(marked: torch.Tensor, side: int = TILE) -> tuple[torch.Tensor, torch.Tensor]:
-    """Count what is marked in each tile: ([rows, columns] how many are, and how many there are), int64.
+    """Count what is marked in each tile: [..., rows, columns] how many are, and [rows, columns] how many there are.
 
     A tile cut off by the border has fewer to show a change with.
 
     Arguments:
-        marked: [H, W] bool, pixels or blocks of them. side: of a tile, in these.
+        marked: [..., H, W] bool, pixels or blocks of them. side: of a tile, in these.
     """
-    height, width = marked.shape
-    both = pad(torch.stack([marked, torch.ones_like(marked)]), (0, -width % side, 0, -height % side))
-    count, number = both.reshape(2, both.shape[1] // side, side, both.shape[2] // side, side).sum((2, 4))
-    return count, number
+    height, width = marked.shape[-2:]
+    rows, columns = -(-height // side), -(-width // side)
+    padded = pad(marked, (0, columns * side - width, 0, rows * side - height))
+    count = padded.reshape(*marked.shape[:-2], rows, side, columns, side).sum((-3, -1))
+    sizes = [
+        (length - torch.arange(0, length, side, device=marked.device)).clamp_max(side) for length in (height, width)
+    ]
+    return count, torch.outer(*sizes)

@@ -27,17 +27,17 @@ THREADED_PIXELS = 1 << 19
 def find_change(before: Sequence[torch.Tensor], now: Sequence[torch.Tensor], threshold: float) -> CpuChange:
     """Return the changed tiles of every view; see ``gsstream.backend.Renderer.find_change``."""
 
-    def of(pair: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
-        return changed_tiles(torch.from_numpy(changed_blocks(pair[0].numpy(), pair[1].numpy(), threshold)))
+    def of(pair: tuple[torch.Tensor, torch.Tensor]) -> BoolArray:
+        return changed_blocks(pair[0].numpy(), pair[1].numpy(), threshold)
 
     height, width = now[0].shape[:2]
     pairs = zip(before, now, strict=True)
     if height * width >= THREADED_PIXELS:
         with ThreadPoolExecutor(num_threads()) as pool:
-            tiles = list(pool.map(of, pairs))
+            blocks = list(pool.map(of, pairs))
     else:
-        tiles = [of(pair) for pair in pairs]
-    return CpuChange(torch.stack(tiles), height, width)
+        blocks = [of(pair) for pair in pairs]
+    return CpuChange(changed_tiles(torch.from_numpy(np.stack(blocks))), height, width)
 
 
 class _VoteCache:

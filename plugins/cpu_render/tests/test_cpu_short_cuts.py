@@ -17,7 +17,7 @@ from gsstream.recipe.load import resolve_recipe
 
 SOURCE = "synthetic:frames=3&views=3&width=64&height=48&supersample=1"
 SETTINGS = (
-    "first_frame.max_iterations=6",
+    "first_frame.max_iterations=30",
     "first_frame.points=recording",
     "first_frame.max_points=400",
     "stream.epochs=2",

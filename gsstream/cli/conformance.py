@@ -24,9 +24,8 @@ def conformance(
         typer.Option(help="A decoder, with its own arguments: it is called with the path of a stream behind them."),
     ] = None,
     vectors: Annotated[
-        Path,
-        typer.Option(metavar="DIR", show_default=False, help="Folder of the suite; without it that of the checkout."),
-    ] = SUITE,
+        Path | None, typer.Option(metavar="DIR", help="Folder of the suite; without it that of the checkout.")
+    ] = None,
 ) -> None:
     """Play the streams of the conformance suite with a decoder, and compare the hash of every frame.
 
@@ -35,7 +34,7 @@ def conformance(
     """
     from gsstream.packet.conformance import by_feature, judge, load_cases, play_here, play_with
 
-    cases = load_cases(vectors)
+    cases = load_cases(vectors or SUITE)
     play = play_here if program is None else play_with(shlex.split(program))
     results: list[Result] = []
     advance = progress_on("stream")

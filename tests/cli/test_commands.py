@@ -62,7 +62,7 @@ OPTIONS = {
     "gsstream new-plugin": ["NAME", "--kind", "--out"],
 }  # fmt: skip
 #: Most of each that gsstream itself may have; what measures is in gsstream-lab.
-COMMANDS, ALL_OPTIONS = 15, 71
+COMMANDS, ALL_OPTIONS = 15, 72
 
 
 @pytest.fixture(autouse=True)

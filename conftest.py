@@ -26,8 +26,8 @@ ROOT = Path(__file__).parent
 #: Files that take longest, longest first. They are begun first: a long file that is begun last keeps one core busy
 #: while the others wait. A name that is missing here costs only time.
 LONG = (
-    "flow/test_closed_loop", "flow/test_repeat_and_resume", "flow/test_resume", "flow/test_key_refresh",
-    "lab/tests/test_sweep_real",
+    "flow/test_closed_loop", "flow/test_kills", "flow/test_repeat_and_resume", "flow/test_resume",
+    "flow/test_key_refresh", "lab/tests/test_sweep_real",
     "cpu_render/tests/test_cross_aarch64", "contract/test_new_plugin", "contract/test_howtos",
     "discovery/test_six_rings", "lab/tests/test_paper_configs", "web/test_page", "flow/test_budget",
     "contract/test_saboteurs", "contract/test_shipped_plugins", "flow/test_no_overshoot", "web/test_live_page",
@@ -37,7 +37,7 @@ LONG = (
     "flow/test_worlds", "input/prepare/test_validate", "lab/tests/test_tune", "queen/tests/test_queen_stream",
     "tools/test_soak", "flow/test_still_frames", "packet/test_corrupt", "input/seeds/test_depth_maps",
     "input/recordings/test_layouts",
-    "flow/test_light_process", "player/test_player_memory", "evaluation/test_offline", "lab/tests/test_compare",
+    "flow/test_light_process", "player/test_player_memory", "evaluation/test_evaluation", "lab/tests/test_compare",
 )  # fmt: skip
 #: What ``make check`` runs: rooms whose tests are cheap, and the one test of whole runs that must never fail.
 QUICK = (

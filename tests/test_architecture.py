@@ -147,3 +147,14 @@ def test_the_requirements_cover_every_distribution_of_this_repository() -> None:
             name, equals, _ = line.partition("==")
             assert equals, f"{line} is not pinned"
             assert f"`{name}`" in documented, f"docs/dependencies.md does not say why {name}"
+
+
+def test_the_lists_of_conftest_name_files_that_exist() -> None:
+    """A name that is gone is no error to pytest: the file would only be begun late, or left out of the quick tests."""
+    source = ast.parse((ROOT / "conftest.py").read_text(encoding="utf-8"))
+    texts = [n.value for n in ast.walk(source) if isinstance(n, ast.Constant) and isinstance(n.value, str)]
+    names = [text for text in texts if "/test_" in text and " " not in text]
+    assert len(names) > 40
+    found = {path.with_suffix("").as_posix() for path in (ROOT / "tests").rglob("test_*.py")}
+    found |= {path.with_suffix("").as_posix() for path in (ROOT / "plugins").glob("*/tests/test_*.py")}
+    assert [name for name in names if not any(path.endswith(f"/{name}") for path in found)] == []

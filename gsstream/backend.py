@@ -13,11 +13,17 @@ from gsstream.parts.backend.base import ScatterSession as ScatterSession
 from gsstream.parts.backend.change import Change as Change
 from gsstream.parts.backend.change import ChangeRule as ChangeRule
 from gsstream.parts.backend.change import changed_tiles as changed_tiles
+from gsstream.parts.backend.replayed_adam import ReplayedAdam as ReplayedAdam
 from gsstream.parts.backend.row_optimiser import RowOptimiser as RowOptimiser
 from gsstream.parts.render.drawn import drawn_rows as drawn_rows
 from gsstream.parts.render.exposure import CameraExposure as CameraExposure
 from gsstream.parts.render.images import check_tiles as check_tiles
 from gsstream.parts.render.loss import Loss as Loss
+from gsstream.parts.render.replay import Recorder as Recorder
+from gsstream.parts.render.replay import Records as Records
+from gsstream.parts.render.replay import recorder_on as recorder_on
+from gsstream.parts.render.replayed import ReplayedSession as ReplayedSession
+from gsstream.parts.render.replayed import SeenView as SeenView
 from gsstream.parts.render.session import RenderCache as RenderCache
 from gsstream.parts.render.session import RenderOutput as RenderOutput
 from gsstream.parts.render.session import RenderSession as RenderSession

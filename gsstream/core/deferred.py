@@ -15,7 +15,9 @@ from typing import Any
 
 #: Makes an error, which says what is wrong, into the one that is raised, which also says whose fault it is.
 Blame = Callable[[Exception], Exception]
-_PENDING: ContextVar[list[tuple[Any, Callable[[], Exception], Blame]] | None] = ContextVar("pending", default=None)
+Check = tuple[Any, Callable[[], Exception], Blame]
+_PENDING: ContextVar[list[Check] | None] = ContextVar("pending", default=None)
+_WATCHED: ContextVar[dict[object, tuple[Callable[[], Any], Callable[[], None]]]] = ContextVar("watched")
 _BLAME: ContextVar[Callable[[], Blame]] = ContextVar("blame", default=lambda: lambda error: error)
 
 
@@ -28,6 +30,30 @@ def require(ok: Any, error: Callable[[], Exception]) -> None:
         raise error()
 
 
+def are_deferred() -> bool:
+    """Say whether checks of numbers on a GPU are put off."""
+    return _PENDING.get() is not None
+
+
+def watch(what: object, holds: Callable[[], Any], act: Callable[[], None]) -> None:
+    """Have ``act()`` called when deferred checks are read and ``holds()``, a tensor [] bool on a GPU, is not true.
+
+    The same thing is watched once; checks must be deferred.
+    """
+    _WATCHED.get()[what] = holds, act
+
+
+@contextmanager
+def collected_checks() -> Iterator[list[Check]]:
+    """Within this context, checks of numbers on a GPU are put into the list and read by whoever asked for it."""
+    checks: list[Check] = []
+    token = _PENDING.set(checks)
+    try:
+        yield checks
+    finally:
+        _PENDING.reset(token)
+
+
 @contextmanager
 def deferred_checks(enabled: bool = True) -> Iterator[None]:
     """Put off the checks of numbers on a GPU to the end of this context; with ``enabled`` false, none is put off.
@@ -35,13 +61,19 @@ def deferred_checks(enabled: bool = True) -> Iterator[None]:
     At the end, the error of the first failed check is raised, as the place of the check would have raised it. Results
     that were computed after this check are wrong, too, and must be given up.
     """
-    pending: list[tuple[Any, Callable[[], Exception], Blame]] = []
-    token = _PENDING.set(pending if enabled else None)
+    pending: list[Check] = []
+    watched: dict[object, tuple[Callable[[], Any], Callable[[], None]]] = {}
+    token, other = _PENDING.set(pending if enabled else None), _WATCHED.set(watched)
     try:
         yield
     finally:
         _PENDING.reset(token)
-    if pending and not bool(reduce(and_, (ok for ok, *_ in pending))):
+        _WATCHED.reset(other)
+    read = [ok for ok, *_ in pending] + [holds() for holds, _ in watched.values()]
+    if read and not bool(reduce(and_, read)):
+        for holds, act in watched.values():
+            if not bool(holds()):
+                act()
         for ok, error, blame in pending:
             if not bool(ok):
                 found = error()

@@ -11,6 +11,7 @@ affected.
 
 from __future__ import annotations
 
+import math
 import sys
 from collections import Counter
 from collections.abc import Callable
@@ -20,6 +21,8 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
+
+from gsstream.backend import Recorder
 
 NAME = "pretend"
 aten = torch.ops.aten
@@ -112,6 +115,58 @@ class PretendDevice(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
 
 _ENTERED: list[PretendDevice] = []
+#: What is recorded at present, to be done again: see PretendRecorder.
+_TAPE: list[Callable[[], None]] | None = None
+_MADE: list[torch.Tensor] = []
+
+
+class PretendRecorder(Recorder):
+    """Records as a CUDA graph does: what it was called with stays, numbers are those of the recording, waits are refused.
+
+    What was computed while recording is overwritten, because a graph computes nothing before it is replayed.
+    """
+
+    def record(self, work: Callable[[], None], *, is_new: bool) -> Callable[[], None]:
+        global _TAPE
+        if is_new:
+            work()
+        _TAPE, tape = [], list[Callable[[], None]]()
+        _MADE.clear()
+        try:
+            work()
+            tape = _TAPE
+        finally:
+            _TAPE = None
+        for made in _MADE:
+            made.fill_(math.nan if made.is_floating_point() else 1)
+
+        def replay() -> None:
+            for step in tape:
+                step()
+            if _ENTERED:
+                _ENTERED[-1].launches += 1
+
+        return replay
+
+
+def _recorded(func: Any, values: Any, named: Any, result: Any) -> None:
+    """Put one operation on the tape; a view needs nothing, because the memory that it looks at stays."""
+    if _TAPE is None or func.is_view:
+        return
+    places = [x for x in tree_leaves(result) if isinstance(x, torch.Tensor)]
+    given = {id(x) for x in tree_leaves((values, named)) if isinstance(x, torch.Tensor)}
+    _MADE.extend(x for x in places if id(x) not in given)
+    if func in ALLOCATIONS:
+        return
+
+    def again() -> None:
+        for place, value in zip(
+            places, (x for x in tree_leaves(func(*values, **named)) if isinstance(x, torch.Tensor)), strict=True
+        ):
+            if value is not place:
+                place.copy_(value)
+
+    _TAPE.append(again)
 
 
 def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
@@ -120,7 +175,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     target = None if kwargs.get("device") is None else torch.device(kwargs["device"]).type
     if not there and target != NAME:
         return func(*args, **kwargs)
-    if _ENTERED and not (func.is_view or func in ALLOCATIONS):
+    if _ENTERED and _TAPE is None and not (func.is_view or func in ALLOCATIONS):
         _ENTERED[-1].launches += 1
     plain = {**kwargs, "device": torch.device("cpu")} if target is not None else kwargs
     values, named = tree_map(_memory, (args, plain))
@@ -128,6 +183,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         result = func(*values, **named)
         if (target == NAME) != bool(there):
             _count("up" if target == NAME else "down")
+        _recorded(func, values, named, result)
         return PretendTensor(result) if target == NAME else result
     # A number of the processor may go along, as with CUDA.
     here = [x for x in tensors if not isinstance(x, PretendTensor) and x.dim() > 0]
@@ -142,6 +198,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if func in SIZED_BY_VALUES or (func is aten.index.Tensor and _has_mask(args[1])):
         _count("waits")
     result = func(*values, **named)
+    _recorded(func, values, named, result)
     known = {id(x.memory): x for x in there}  # what works in place returns the very tensor it was given
     return tree_map(lambda x: known[id(x)] if id(x) in known else _tensor(x), result)
 
@@ -167,6 +224,8 @@ def _tensor(x: Any) -> Any:
 
 
 def _count(what: str) -> None:
+    if _TAPE is not None:
+        raise RuntimeError(f"a graph cannot be recorded: {what} is not allowed meanwhile")
     if not _ENTERED:
         return
     frame = sys._getframe(1)
@@ -206,20 +265,45 @@ class _Kernel(torch.autograd.Function):
             out = function(*inner[:cut], **dict(zip(names, inner[cut:], strict=True)))
         ctx.inner, ctx.out = inner, out if isinstance(out, tuple) else (out,)
         found = tuple(PretendTensor(x.detach()) if isinstance(x, torch.Tensor) else x for x in ctx.out)
+
+        def again() -> None:
+            with torch.enable_grad():
+                out = function(*inner[:cut], **dict(zip(names, inner[cut:], strict=True)))
+            ctx.out = out if isinstance(out, tuple) else (out,)
+            for made, x in zip(found, ctx.out, strict=True):
+                if isinstance(made, PretendTensor):
+                    made.memory.copy_(x.detach())
+
+        if _TAPE is not None:
+            _TAPE.append(again)
         pairs = [(made, x) for made, x in zip(found, ctx.out, strict=True) if isinstance(made, PretendTensor)]
         ctx.mark_non_differentiable(*(made for made, x in pairs if not x.requires_grad))
         return found if isinstance(out, tuple) else found[0]
 
     @staticmethod
     def backward(ctx: Any, *upstream: Any) -> Any:
-        roots = [
-            (x, grad.memory)
-            for x, grad in zip(ctx.out, upstream, strict=True)
-            if isinstance(x, torch.Tensor) and x.requires_grad and grad is not None
-        ]
         leaves = [x for x in ctx.inner if isinstance(x, torch.Tensor) and x.requires_grad]
-        outputs, grads = [x for x, _ in roots], [grad for _, grad in roots]
-        found = iter(torch.autograd.grad(outputs, leaves, grads, retain_graph=True, allow_unused=True))
+
+        def gradients() -> tuple[torch.Tensor | None, ...]:
+            roots = [
+                (x, grad.memory)
+                for x, grad in zip(ctx.out, upstream, strict=True)
+                if isinstance(x, torch.Tensor) and x.requires_grad and grad is not None
+            ]
+            outputs, grads = [x for x, _ in roots], [grad for _, grad in roots]
+            return torch.autograd.grad(outputs, leaves, grads, retain_graph=True, allow_unused=True)
+
+        first = gradients()
+
+        def again() -> None:
+            for made, x in zip(first, gradients(), strict=True):
+                if made is not None and x is not None:
+                    made.copy_(x)
+
+        if _TAPE is not None:
+            _TAPE.append(again)
+            _MADE.extend(x for x in first if x is not None)
+        found = iter(first)
         back = [next(found) if isinstance(x, torch.Tensor) and x.requires_grad else None for x in ctx.inner]
         return (None, None, *(None if grad is None else PretendTensor(grad) for grad in back))
 
@@ -231,7 +315,7 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     def call(*args: Any, **kwargs: Any) -> Any:
-        if _ENTERED:
+        if _ENTERED and _TAPE is None:
             _ENTERED[-1].launches += 1
         return _Kernel.apply(function, tuple(kwargs), *args, *kwargs.values())  # type: ignore[no-untyped-call]
 

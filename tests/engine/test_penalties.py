@@ -39,10 +39,14 @@ def scene_of(means: torch.Tensor, scales: torch.Tensor, opacities: torch.Tensor)
     )
 
 
+def center_of(scene: Gaussians[torch.Tensor]) -> torch.Tensor:
+    return torch.as_tensor(camera().centers[0]).to(scene.means)
+
+
 def grads(scene: Gaussians[torch.Tensor], price: float) -> tuple[torch.Tensor, torch.Tensor]:
     found = scene.map(torch.zeros_like)
     found.opacities.fill_(DRAWN)
-    add_penalty_grad(found, scene, camera(), 0, EXTENT, price)
+    add_penalty_grad(found, scene, camera(), view=0, center=center_of(scene), extent=EXTENT, area_price=price)
     for name in ("means", "quats", "sh0"):
         assert not getattr(found, name).any()
     return found.scales, found.opacities - DRAWN
@@ -110,7 +114,7 @@ def test_only_what_the_view_drew_pays_for_what_it_covers() -> None:
     scene = scene_of(torch.zeros(2, 3), torch.full((2, 3), -2.0), torch.zeros(2))
     found = scene.map(torch.zeros_like)
     found.opacities[0] = DRAWN
-    add_penalty_grad(found, scene, camera(), 0, EXTENT, PRICE)
+    add_penalty_grad(found, scene, camera(), view=0, center=center_of(scene), extent=EXTENT, area_price=PRICE)
     free = grads(scene, 0.0)
     assert torch.equal(found.scales[1], free[0][1])
     assert torch.equal(found.opacities[1:], free[1][1:])

@@ -57,8 +57,10 @@ class TrainedGates:
     def _noise(self) -> torch.Tensor | None:
         return self.gate.noise(self.hierarchy.num_nodes, self._generator)
 
-    def sample(self, frozen: torch.Tensor | None) -> torch.Tensor:
-        noise = self._ahead.pop(0) if self._ahead else self._noise()
+    def noise(self) -> torch.Tensor | None:
+        return self._ahead.pop(0) if self._ahead else self._noise()
+
+    def sample(self, noise: torch.Tensor | None, frozen: torch.Tensor | None) -> torch.Tensor:
         per_row = self.gate.sample(self.logits, noise)[self.node_of]
         return per_row if frozen is None else per_row * ~frozen
 

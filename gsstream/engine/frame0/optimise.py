@@ -196,6 +196,7 @@ class FirstFrameRun:
         )
         self.smooth_depth = SmoothDepth(self.renderer, self.frame, self.device)
         self.half_size = torch.tensor([self.frame.cameras.width / 2, self.frame.cameras.height / 2]).to(self.device)
+        self.centers = torch.as_tensor(self.frame.cameras.centers).float().to(self.device)
 
     def passes(self, first: int, last: int) -> Iterator[int]:
         """Make the iterations from first to last, and yield the number of each.
@@ -229,7 +230,15 @@ class FirstFrameRun:
             self.smooth_depth.add_grad(wrt.placed(), view, found.grad, weight)
         self.table.set_lr("means", self.extent * self.level.lr_at(iteration))
         price = self._area_price(iteration)
-        add_penalty_grad(found.grad, scene, self.frame.cameras, view=view, extent=self.extent, area_price=price)
+        add_penalty_grad(
+            found.grad,
+            scene,
+            self.frame.cameras,
+            view=view,
+            center=self.centers[view],
+            extent=self.extent,
+            area_price=price,
+        )
         self.table.step(dict(found.grad.items()))
         if found.means2d is not None:
             self.statistics = self.statistics.add(found.means2d * self.half_size)

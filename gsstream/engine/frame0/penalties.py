@@ -25,6 +25,7 @@ def add_penalty_grad(
     scene: Gaussians[torch.Tensor],
     cameras: Cameras,
     view: int,
+    center: torch.Tensor,
     extent: float,
     area_price: float,
 ) -> None:
@@ -40,7 +41,8 @@ def add_penalty_grad(
             where that of its opacity is not 0.
         scene: [N] raw values.
         cameras: of the pictures that are compared.
-        view: camera from which distances are taken.
+        view: camera that covered pixels are counted in.
+        center: [3] where it stands, on the device of the scene: copied in every iteration, it would be waited for.
         extent: of the rig, in scene units, above 0.
         area_price: in units of the loss, at least 0; 0: what is covered has no price.
     """
@@ -52,7 +54,7 @@ def add_penalty_grad(
     if area_price == 0:
         return
     # Axis by axis, each in a row of its own: numbers by row and by axis are slow to multiply.
-    away = _by_axis(scene.means) - torch.as_tensor(cameras.centers[view])[:, None].to(scene.means)
+    away = _by_axis(scene.means) - center[:, None]
     x2, y2, z2 = away * away
     focal2 = float(cameras.Ks[view, 0, 0] * cameras.Ks[view, 1, 1])
     per_area = 2 * math.pi / 3 * focal2 / (cameras.width * cameras.height) * drawn / (x2 + y2 + z2).clamp_min(NEAREST2)

@@ -39,7 +39,7 @@ class _Known(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, gradients: tuple[torch.Tensor, ...], *_roots: torch.Tensor) -> torch.Tensor:
         ctx.gradients = gradients
-        return torch.zeros(())
+        return gradients[0].new_zeros(())
 
     @staticmethod
     def backward(ctx: Any, *_upstream: Any) -> Any:

@@ -120,9 +120,11 @@ def ssim_and_grads(planes: torch.Tensor, target: PreparedTarget) -> tuple[torch.
 
 def _windowed(planes: torch.Tensor) -> torch.Tensor:
     """Weighted means over the window around every pixel of planes [n, 1, H, W]; beyond the border stand zeros."""
-    weights = window_weights(planes.device, planes.dtype)
-    down = conv2d(planes, weights, padding=(WINDOW // 2, 0))
-    return conv2d(down, weights.transpose(2, 3), padding=(0, WINDOW // 2))
+    # As n channels of one picture, each slid over by itself: half of the time of n pictures of one channel.
+    channels, count = planes.transpose(0, 1), len(planes)
+    weights = window_weights(planes.device, planes.dtype).expand(count, 1, WINDOW, 1)
+    down = conv2d(channels, weights, padding=(WINDOW // 2, 0), groups=count)
+    return conv2d(down, weights.transpose(2, 3), padding=(0, WINDOW // 2), groups=count).transpose(0, 1)
 
 
 @functools.cache

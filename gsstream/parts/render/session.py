@@ -15,7 +15,7 @@ from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.parts.render.backward import backward, gradient_of
 from gsstream.parts.render.images import float_image, spread_to_pixels
 from gsstream.parts.render.target import ViewTarget
-from gsstream.parts.render.transforms import curvature_of, weighted_structure_tensor
+from gsstream.parts.render.transforms import Pinhole, curvature_of, weighted_structure_tensor
 from gsstream.parts.render.wrt import G, LossAndGrad, Wrt, WrtTransforms
 
 
@@ -216,6 +216,10 @@ class RenderSession(ABC):
             f"{type(self).__name__} has no method 'commit' to go on to the next frame; install its plugin again"
         )
 
+    def pinhole(self, view: int) -> Pinhole:
+        """Return a camera as numbers; a session on a device may give tensors [] that are there already."""
+        return Pinhole.of(self.cameras, view)
+
     def cache_bytes(self) -> RenderCache:
         """Return what is kept for the cameras; empty for a renderer that caches nothing."""
         return RenderCache()
@@ -249,4 +253,5 @@ def _curvature(
     recorded = target.exposure.apply(image.detach()) if target.exposure else image.detach()
     # The gradient of a pixel by a colour is the share that its Gaussian has of the pixel's light.
     backward([image], [weighted_structure_tensor(recorded, float_image(target.image))])
-    return curvature_of(rows.means, transforms, session.cameras, view=view, structure=gradient_of(colour)[:, 0] / SH0)
+    structure = gradient_of(colour)[:, 0] / SH0
+    return curvature_of(rows.means, transforms, session.cameras, camera=session.pinhole(view), structure=structure)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import torch
 
@@ -48,8 +49,29 @@ def transform_vjp(leaves: Gaussians[torch.Tensor], transforms: GroupTransforms[t
     return out.index_add_(0, transforms.group, torch.cat([force, torque], 1))
 
 
+class Pinhole(NamedTuple):
+    """A camera as numbers, or as tensors [] where the rows are: both go along with every operation.
+
+    ``rotation`` three rows of three, ``offset`` three: from the world to the camera. ``focal`` two, pixels.
+    """
+
+    rotation: Any
+    offset: Any
+    focal: Any
+
+    @staticmethod
+    def of(cameras: Cameras, view: int) -> Pinhole:
+        """Return a camera of a rig as numbers: a matrix would be copied to the device of the rows."""
+        pose = cameras.viewmats[view]
+        return Pinhole(pose[:3, :3].tolist(), pose[:3, 3].tolist(), cameras.Ks[view].diagonal()[:2].tolist())
+
+
 def curvature_of(
-    means: torch.Tensor, transforms: GroupTransforms[torch.Tensor], cameras: Cameras, view: int, structure: torch.Tensor
+    means: torch.Tensor,
+    transforms: GroupTransforms[torch.Tensor],
+    cameras: Cameras,
+    camera: Pinhole,
+    structure: torch.Tensor,
 ) -> torch.Tensor:
     """Return the curvature [K, 6, 6] float64 of a view's loss by shift and turn of groups of rows.
 
@@ -61,9 +83,12 @@ def curvature_of(
 
     Arguments:
         means: [A, 3] centres of the rows after the move.
+        transforms: of their groups.
+        cameras: the rig.
+        camera: the view, one of its cameras.
         structure: [A, 3] of the picture's structure tensor (xx, xy, yy), the share that each row has.
     """
-    by_row = _on_screen(means.double(), transforms, cameras, view)
+    by_row = _on_screen(means.double(), transforms, camera, cameras.near_plane)
     xx, xy, yy = structure.double().unbind(1)
     tensor = torch.stack([torch.stack([xx, xy], -1), torch.stack([xy, yy], -1)], -2)
     out = by_row.new_zeros(len(transforms.center), 6, 6)
@@ -72,20 +97,16 @@ def curvature_of(
 
 
 def _on_screen(
-    means: torch.Tensor, transforms: GroupTransforms[torch.Tensor], cameras: Cameras, view: int
+    means: torch.Tensor, transforms: GroupTransforms[torch.Tensor], camera: Pinhole, near: float
 ) -> torch.Tensor:
     """[A, 2, 6] derivative of each row's place on the screen, pixels, by shift and turn of its group."""
-    # As numbers, which go along with every operation: a matrix would be copied to the device.
-    rotation, offset = cameras.viewmats[view, :3, :3].tolist(), cameras.viewmats[view, :3, 3].tolist()
+    rotation, offset, focal = camera
     x, y, z = means.unbind(1)
     seen = [row[0] * x + row[1] * y + row[2] * z + at for row, at in zip(rotation, offset, strict=True)]
-    depth = seen[2].clamp_min(cameras.near_plane)
+    depth = seen[2].clamp_min(near)
     by_shift = [
         torch.stack(
-            [
-                float(cameras.Ks[view, i, i]) * (rotation[i][axis] - seen[i] / depth * rotation[2][axis]) / depth
-                for axis in range(3)
-            ],
+            [focal[i] * (rotation[i][axis] - seen[i] / depth * rotation[2][axis]) / depth for axis in range(3)],
             1,
         )
         for i in range(2)

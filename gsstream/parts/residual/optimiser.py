@@ -47,7 +47,10 @@ class Gates(Protocol):
     @property
     def num_gaussians(self) -> int: ...
 
-    def sample(self, frozen: torch.Tensor | None) -> torch.Tensor:
+    def noise(self) -> torch.Tensor | None:
+        """Return the noise [M] of the next iteration, where the logits are; None: the gate part takes none."""
+
+    def sample(self, noise: torch.Tensor | None, frozen: torch.Tensor | None) -> torch.Tensor:
         """Return the gates [A] of the rows, with a graph; those of ``frozen`` rows [A] bool are 0."""
 
     def step(
@@ -66,13 +69,13 @@ class Gates(Protocol):
 class Iteration(NamedTuple):
     """One iteration: ``view`` and its ``target``, rows that are not trained yet, factor on the learning rates.
 
-    ``frozen`` [A] bool; None: all rows are trained.
+    ``frozen`` [A] bool; None: all rows are trained. ``lr_factor`` is a number, or a tensor [] where the rows are.
     """
 
     view: int
     target: ViewTarget
     frozen: torch.Tensor | None
-    lr_factor: float
+    lr_factor: float | torch.Tensor
 
 
 @final
@@ -133,16 +136,16 @@ class ResidualOptimiser(ABC, Generic[S]):
         """Return the A rows with their residual behind ``gates`` [A], contiguous, without a graph."""
 
     @abstractmethod
-    def backward(self, grad: Gaussians[torch.Tensor], rd_lambda: float) -> torch.Tensor:
+    def backward(self, grad: Gaussians[torch.Tensor], rd_lambda: float | torch.Tensor) -> torch.Tensor:
         """Backpropagate dL/drows to latents, decoders and gates; return dL/dgates [A].
 
         Arguments:
             grad: dL/drows, shaped like the rows that :meth:`forward` returned last.
-            rd_lambda: loss per bit of the latents behind open gates; 0: bits cost nothing.
+            rd_lambda: loss per bit of the latents behind open gates; the number 0: bits cost nothing.
         """
 
     @abstractmethod
-    def step(self, lr_factor: float = 1.0) -> None:
+    def step(self, lr_factor: float | torch.Tensor = 1.0) -> None:
         """Make one Adam step from the last :meth:`backward`, plus the gradient in ``latents.grad``.
 
         Arguments:
@@ -157,16 +160,27 @@ class ResidualOptimiser(ABC, Generic[S]):
         This body is the truth. An optimiser may override it with one that does the same in one call, up to rounding,
         and calls this one for the iterations that it does not cover, among them one in which it finds a fault.
         """
+        return self.run_with(epoch, [epoch.gates.noise() for _ in epoch.iterations])
+
+    def run_with(self, epoch: ResidualEpoch[S], noises: Sequence[torch.Tensor | None]) -> list[torch.Tensor]:
+        """Make these iterations with noise that was drawn, and return their losses []."""
         losses = []
-        for place, now in enumerate(epoch.iterations):
+        for place, (now, noise) in enumerate(zip(epoch.iterations, noises, strict=True)):
             epoch.begin(place)
-            gates = epoch.gates.sample(now.frozen)
-            found = epoch.session.loss_and_grad(now.view, now.target, WrtRows(self.forward(gates.detach())))
-            by_gate = self.backward(found.grad, epoch.rd_lambda)
-            epoch.gates.step(gates, by_gate, self.position, now.frozen)
-            self.step(now.lr_factor)
-            losses.append(found.loss)
+            losses.append(self.iterate(epoch.session, epoch.gates, now, noise=noise, rd_lambda=epoch.rd_lambda))
         return losses
+
+    @final
+    def iterate(
+        self, session: S, gates: Gates, now: Iteration, noise: torch.Tensor | None, rd_lambda: float | torch.Tensor
+    ) -> torch.Tensor:
+        """Make one iteration and return its loss []. Nothing in it reads a value, so a GPU need not be waited for."""
+        opened = gates.sample(noise, now.frozen)
+        found = session.loss_and_grad(now.view, now.target, WrtRows(self.forward(opened.detach())))
+        by_gate = self.backward(found.grad, rd_lambda)
+        gates.step(opened, by_gate, self.position, now.frozen)
+        self.step(now.lr_factor)
+        return found.loss
 
     @abstractmethod
     def select_rows(self, rows: torch.Tensor) -> None:

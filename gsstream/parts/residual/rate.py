@@ -32,7 +32,7 @@ def laplace_bits(latents: torch.Tensor, step: float | torch.Tensor, spread: torc
 
 
 def laplace_gradient(
-    latents: torch.Tensor, step: float | torch.Tensor, spread: torch.Tensor, weight: float = 1.0
+    latents: torch.Tensor, step: float | torch.Tensor, spread: torch.Tensor, weight: float | torch.Tensor = 1.0
 ) -> torch.Tensor:
     """Return [A, L]: derivative of ``weight`` times :func:`laplace_bits` by the latents. The spread is held fixed."""
     u = latents / step
@@ -43,7 +43,9 @@ def laplace_gradient(
     return torch.where(magnitude < 0.5, inside, 1.0).copysign_(u).div_(spread * (step * (_LN2 / weight)))
 
 
-def rate_gradient(latents: torch.Tensor, steps: torch.Tensor, gates: torch.Tensor, weight: float) -> torch.Tensor:
+def rate_gradient(
+    latents: torch.Tensor, steps: torch.Tensor, gates: torch.Tensor, weight: float | torch.Tensor
+) -> torch.Tensor:
     """Return [A, L]: gradient of ``weight`` times the bits of all rows behind open gates.
 
     It is to be added to the gradient of the latents.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import final
-
 import torch
 
 from gsstream.core.gaussians import Gaussians
@@ -16,7 +14,6 @@ from gsstream.parts.residual.rate import rate_gradient
 from gsstream.parts.residual.row_parameters import RowParameters
 
 
-@final
 class JointResidualOptimiser(ResidualOptimiser[RenderSession]):
     """Calls the map of latents to attributes, its gradient, the rate's gradient and the row optimiser's ``step``."""
 
@@ -56,15 +53,15 @@ class JointResidualOptimiser(ResidualOptimiser[RenderSession]):
         self._change = decode_joint(self._code, self.latents.detach(), self.matrix, self._units)
         return add_joint(self._code, self._base, self._features, change=self._change, gates=gates)
 
-    def backward(self, grad: Gaussians[torch.Tensor], rd_lambda: float) -> torch.Tensor:
+    def backward(self, grad: Gaussians[torch.Tensor], rd_lambda: float | torch.Tensor) -> torch.Tensor:
         upstream = join_features(self._code, grad)
         back = joint_vjp(self._code, upstream, self._change, matrix=self.matrix, gates=self._gates, units=self._units)
-        if rd_lambda:
+        if isinstance(rd_lambda, torch.Tensor) or rd_lambda:
             back.latents.add_(rate_gradient(self.latents.detach(), self._code.steps, self._gates, rd_lambda))
         self._grad = back
         return back.gates
 
-    def step(self, lr_factor: float = 1.0) -> None:
+    def step(self, lr_factor: float | torch.Tensor = 1.0) -> None:
         self._latents.step({"latents": self._grad.latents}, lr_factor)
         self._decoders.step({"matrix": self._grad.matrix}, lr_factor)
 

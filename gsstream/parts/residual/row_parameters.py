@@ -40,7 +40,7 @@ class RowParameters:
     def __getitem__(self, name: str) -> torch.Tensor:
         return self.leaves[name]
 
-    def step(self, gradients: Mapping[str, torch.Tensor] = EMPTY, lr_factor: float = 1.0) -> None:
+    def step(self, gradients: Mapping[str, torch.Tensor] = EMPTY, lr_factor: float | torch.Tensor = 1.0) -> None:
         """Make one Adam step from ``gradients`` plus the ``.grad`` of the leaves, which is then cleared."""
         total = dict(gradients)
         for name, leaf in self.leaves.items():

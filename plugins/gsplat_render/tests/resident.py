@@ -7,18 +7,22 @@ from typing import Any
 
 import torch
 from gsstream_gsplat_render.kernels import Kernels
-from gsstream_gsplat_render.renderer import GsplatSession
-from gsstream_gsplat_render.rig import rigs_on
+from gsstream_gsplat_render.rig import Rigs
+from gsstream_gsplat_render.session import GsplatSession
 from torch_kernels import TORCH_KERNELS
 
+from gsstream.backend import ReplayedAdam, RowOptimiser
 from gsstream.core.part import PartConfig
 from gsstream.parts.backend.base import Renderer
 from gsstream.parts.render.session import RenderOutput
 from gsstream.testing import MethodUnderTest
-from gsstream.testing.pretend import DEVICE, kernel
+from gsstream.testing.pretend import DEVICE, PretendRecorder, kernel
 
 ON_DEVICE = Kernels(*(kernel(getattr(TORCH_KERNELS, field.name)) for field in fields(Kernels)))
 CPU = torch.device("cpu")
+
+
+RIGS = {"cpu": Rigs(CPU), "pretend": Rigs(DEVICE, PretendRecorder())}
 
 
 class StandIn(Renderer):
@@ -33,12 +37,16 @@ class StandIn(Renderer):
     def device(self) -> torch.device:
         return torch.device(self.config.place)
 
+    @property
+    def optimiser(self) -> RowOptimiser:
+        return ReplayedAdam()
+
     def render(self, gaussians: Any, cameras: Any, view: int, background: Any) -> RenderOutput:
         return self.open(gaussians, None, cameras, background).render(view, gaussians)
 
     def open(self, gaussians: Any, active: Any, cameras: Any, background: Any) -> GsplatSession:
         kernels = TORCH_KERNELS if self.device == CPU else ON_DEVICE
-        return GsplatSession(kernels, rigs_on(self.config.place), gaussians, active, cameras, background)
+        return GsplatSession(kernels, RIGS[self.device.type], gaussians, active, cameras, background)
 
 
 def method_on(device: torch.device, name: str = "s2gs-fast") -> MethodUnderTest:

@@ -74,8 +74,10 @@ def tiles(
     assert (packed, n_images) == (False, 1)
     seen, nothing = (radii > 0).all(-1), torch.zeros(())
     means2d, depths = means2d.detach().where(seen[..., None], nothing), depths.detach().where(seen, nothing)
-    found: tuple[torch.Tensor, ...] = gsplat._isect_tiles(means2d, radii, depths, tile_size, columns, rows)
-    return found
+    number, keys, order = gsplat._isect_tiles(means2d, radii, depths, tile_size, columns, rows, sort=False)
+    # As the kernel does it: Gaussians of equal depth stay in their order.
+    keys, place = keys.sort(stable=True)
+    return number, keys, order[place]
 
 
 def offsets(keys: torch.Tensor, n_images: int, columns: int, rows: int) -> torch.Tensor:
@@ -99,7 +101,8 @@ def rasterize(
     packed: bool,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     assert not packed
-    rows, columns = starts.shape[-2:]
+    # There may be more rows of tiles than the picture has: they hold what is left of lists of fixed size.
+    rows, columns = -(-height // tile_size), starts.shape[-1]
     bounds = [*starts.flatten().tolist(), len(order)]
     image, alpha = [], []
     for row in range(rows):

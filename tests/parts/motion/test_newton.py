@@ -18,7 +18,7 @@ from gsstream.packet import PlayerState
 from gsstream.parts.motion.fitting import narrow_to
 from gsstream.parts.motion.groups import changed_groups, known_groups, pixel_size
 from gsstream.parts.motion.newton import BodySettings, DampedNewton, Damping, fit_transforms_newton
-from gsstream.parts.render.transforms import curvature_of
+from gsstream.parts.render.transforms import Pinhole, curvature_of
 from gsstream.parts.render.wrt import WrtTransforms
 from gsstream.testing.cases import get_case
 from gsstream.testing.working import FitFixture, fit_fixture
@@ -100,7 +100,7 @@ def test_curvature_is_how_far_rows_go_on_the_screen_times_what_holds_them_there(
         return transformed64(base, moves._replace(translation=moves.translation + along[:, :3], rotation=along[:, 3:]))
 
     now = moved(0.0)
-    given = torch.from_numpy(now), moves.map(torch.from_numpy), case.cameras, 1, torch.from_numpy(structure)
+    given = torch.from_numpy(now), moves.map(torch.from_numpy), case.cameras, Pinhole.of(case.cameras, 1), torch.from_numpy(structure)
     curvature = curvature_of(*given).numpy()
     step = (places(moved(1e-5), case, 1) - places(moved(-1e-5), case, 1)) / 2e-5
     held = np.einsum("ai,aij,aj->a", step, tensors, step)

@@ -8,9 +8,12 @@ from dataclasses import dataclass
 import torch
 
 from gsstream.api import Cameras
+from gsstream.backend import Recorder, Records, recorder_on
+from gsstream_gsplat_render.tiles import TILE, Grid
 
-TILE = 16
 Background = tuple[float, float, float]
+#: Entries of the lists of tiles: room beyond what was seen, and the unit in which lists grow.
+ROOM, LEAST = 1.25, 1 << 16
 #: Rigs that are kept: the sizes of the pictures of frame 0, and that of half size that depth is drawn in.
 KEPT = 8
 
@@ -19,14 +22,12 @@ KEPT = 8
 class Target:
     """A camera and its background on the device.
 
-    ``viewmat`` [1, 4, 4], ``K`` [1, 3, 3], ``background`` [1, 3], ``corner`` [2] number of tiles across and down, all
-    float32.
+    ``viewmat`` [1, 4, 4], ``K`` [1, 3, 3], ``background`` [1, 3], all float32.
     """
 
     viewmat: torch.Tensor
     K: torch.Tensor
     background: torch.Tensor
-    corner: torch.Tensor
     width: int
     height: int
     near: float
@@ -34,7 +35,12 @@ class Target:
     @property
     def tiles(self) -> tuple[int, int]:
         """Tile rows and columns; partial tiles count."""
-        return -(-self.height // TILE), -(-self.width // TILE)
+        return tiles_of(self)
+
+
+def tiles_of(picture: Target | Cameras) -> tuple[int, int]:
+    """Return tile rows and columns; partial tiles count."""
+    return -(-picture.height // TILE), -(-picture.width // TILE)
 
 
 class Rig:
@@ -44,28 +50,62 @@ class Rig:
     for.
     """
 
-    def __init__(self, cameras: Cameras, background: Background, device: torch.device) -> None:
+    def __init__(
+        self, cameras: Cameras, background: Background, device: torch.device, recorder: Recorder | None
+    ) -> None:
         self.cameras, self.background, self.device = cameras, background, device
         self._targets: dict[int, Target] = {}
+        self._numbers: dict[int, torch.Tensor] = {}
+        self.recorder = recorder
+        #: Of scenes of which every row changes; those of a narrowed one are its session's.
+        self.records = None if recorder is None else Records(recorder)
+        self._entries, self._grid = 0, Grid(*tiles_of(cameras), capacity=LEAST, device=device)
 
     def __getitem__(self, view: int) -> Target:
         if view not in self._targets:
             cameras = self.cameras
-            tiles = -(-cameras.width // TILE), -(-cameras.height // TILE)
-            viewmat, K, background, corner = (
+            viewmat, K, background = (
                 torch.as_tensor(value, dtype=torch.float32).to(self.device)
-                for value in (cameras.viewmats[view], cameras.Ks[view], self.background, tiles)
+                for value in (cameras.viewmats[view], cameras.Ks[view], self.background)
             )
             size = cameras.width, cameras.height, cameras.near_plane
-            self._targets[view] = Target(viewmat[None], K[None], background[None], corner, *size)
+            self._targets[view] = Target(viewmat[None], K[None], background[None], *size)
         return self._targets[view]
+
+    def numbers(self, view: int) -> torch.Tensor:
+        """Return [14] float64: rotation of a camera row by row, offset, focal lengths."""
+        if view not in self._numbers:
+            pose, focal = torch.as_tensor(self.cameras.viewmats[view]), torch.as_tensor(self.cameras.Ks[view])
+            found = torch.cat([pose[:3, :3].flatten(), pose[:3, 3], focal.diagonal()[:2]]).double()
+            self._numbers[view] = found.to(self.device)
+        return self._numbers[view]
+
+    @property
+    def grid(self) -> Grid:
+        """What lists of tiles need; it has room for half as many entries again as were ever seen."""
+        if self._entries > self._grid.capacity / ROOM:
+            capacity = -(-int(self._entries * ROOM**2) // LEAST) * LEAST
+            self._grid = Grid(*tiles_of(self.cameras), capacity=capacity, device=self.device)
+        return self._grid
+
+    def count(self, entries: int) -> None:
+        """Take note of how many entries a view needed."""
+        self._entries = max(self._entries, entries)
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether a view was drawn, so that the size of the lists is no guess."""
+        return self._entries > 0
 
 
 class Rigs:
-    """The rigs that were drawn last on a device, so that one that is drawn again is not copied again."""
+    """The rigs that were drawn last on a device, so that one that is drawn again is not copied again.
 
-    def __init__(self, device: torch.device) -> None:
-        self.device = device
+    ``recorder``: of the device; None: nothing is recorded there.
+    """
+
+    def __init__(self, device: torch.device, recorder: Recorder | None = None) -> None:
+        self.device, self.recorder = device, recorder
         self._last: list[Rig] = []
 
     def find(self, cameras: Cameras, background: Background) -> Rig:
@@ -73,7 +113,7 @@ class Rigs:
         for rig in self._last:
             if rig.background == background and (rig.cameras is cameras or _same(rig.cameras, cameras)):
                 return rig
-        self._last = [Rig(cameras, background, self.device), *self._last[: KEPT - 1]]
+        self._last = [Rig(cameras, background, self.device, self.recorder), *self._last[: KEPT - 1]]
         return self._last[0]
 
 
@@ -86,4 +126,5 @@ def _same(one: Cameras, other: Cameras) -> bool:
 @functools.cache
 def rigs_on(device: str) -> Rigs:
     """Return the rigs of a device; all renderers that work on it share them."""
-    return Rigs(torch.device(device))
+    place = torch.device(device)
+    return Rigs(place, recorder_on(place))

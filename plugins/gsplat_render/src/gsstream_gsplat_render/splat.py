@@ -2,41 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 
 from gsstream.api import Gaussians
 from gsstream_gsplat_render.kernels import Kernels
-from gsstream_gsplat_render.rig import TILE, Target
+from gsstream_gsplat_render.rig import Target
+from gsstream_gsplat_render.seen import Projected
+from gsstream_gsplat_render.tiles import TILE, Grid, tile_lists
 
 BLUR = 0.3  # px^2, added to the 2-D covariance: what gsplat calls eps2d
 FAR = 1e10
 
 
 @dataclass(frozen=True, slots=True)
-class Projected:
-    """Gaussians as one camera sees them, on the device."""
-
-    visible: torch.Tensor  # [N] bool, it touches the image; of all others gsplat leaves the rest undefined
-    means2d: torch.Tensor  # [N, 2] pixels
-    depths: torch.Tensor  # [N]
-    conics: torch.Tensor  # [N, 3]
-    colors: torch.Tensor  # [N, 3]
-    opacities: torch.Tensor  # [N]
-    radii: torch.Tensor  # [N, 2] int32, half the sides of the box in which it is drawn, pixels
-
-    def rows(self, index: torch.Tensor) -> Projected:
-        """Return some of them."""
-        return Projected(*(getattr(self, field.name)[index] for field in fields(self)))
-
-
-@dataclass(frozen=True, slots=True)
 class Drawn:
-    """Image [H, W, 3] and alpha [H, W] on the device; differentiable."""
+    """Image [H, W, 3] and alpha [H, W] on the device; differentiable. ``entries``: of the lists of tiles."""
 
     image: torch.Tensor
     alpha: torch.Tensor
+    entries: int
 
 
 def project(
@@ -80,28 +66,56 @@ def project(
 def composite(kernels: Kernels, seen: Projected, view: Target, mask: torch.Tensor | None = None) -> Drawn:
     """Composite what was projected; with a mask [tile rows, tile columns] in its tiles, else show the background."""
     rows, columns = view.tiles
-    means2d, radii = seen.means2d[None], seen.radii[None]
-    _, keys, order = kernels.tiles(means2d, radii, seen.depths[None], TILE, columns, rows, packed=False, n_images=1)
-    offsets = kernels.offsets(keys, 1, columns, rows).reshape(1, rows, columns)
+    means2d, radii, depths = seen.means2d[None], seen.radii[None], seen.depths[None]
+    _, keys, order = kernels.tiles(means2d, radii, depths, TILE, columns, rows, packed=False, n_images=1)
+    offsets = kernels.offsets(keys, 1, columns, rows).reshape(rows, columns)
+    image, alpha = _rasterized(kernels, seen, view, offsets=offsets, order=order, mask=mask)
+    return _shown(image, alpha, mask, view, entries=len(order))
+
+
+def composite_fixed(
+    kernels: Kernels, seen: Projected, view: Target, grid: Grid, edges: torch.Tensor, mask: torch.Tensor | None = None
+) -> Drawn:
+    """Composite with lists of fixed size (:mod:`gsstream_gsplat_render.tiles`); nothing is waited for.
+
+    Where the lists are too short, nothing is drawn, so no gradient is wrong, and the grid remembers it.
+    """
+    lists = tile_lists(seen, edges, grid)
+    wanted = grid.inside if mask is None else torch.cat([mask, grid.outside])
+    image, alpha = _rasterized(kernels, seen, view, offsets=lists.offsets, order=lists.order, mask=wanted & lists.fits)
+    return _shown(image, alpha, mask, view, entries=grid.capacity)
+
+
+def _rasterized(
+    kernels: Kernels,
+    seen: Projected,
+    view: Target,
+    offsets: torch.Tensor,
+    order: torch.Tensor,
+    mask: torch.Tensor | None,
+) -> tuple[torch.Tensor, torch.Tensor]:
     image, alpha = kernels.rasterize(
-        means2d,
+        seen.means2d[None],
         seen.conics[None],
         seen.colors[None],
         seen.opacities[None],
         view.width,
         view.height,
         TILE,
-        offsets,
+        offsets[None],
         order,
         backgrounds=view.background,
         masks=None if mask is None else mask[None],
         packed=False,
     )
-    image, alpha = image.squeeze(0), alpha.squeeze((0, 3))
+    return image.squeeze(0), alpha.squeeze((0, 3))
+
+
+def _shown(image: torch.Tensor, alpha: torch.Tensor, mask: torch.Tensor | None, view: Target, entries: int) -> Drawn:
     if mask is not None:
         # gsplat 1.5 writes the background into masked tiles but leaves their alpha as the memory was.
         alpha = torch.where(pixels(mask, view), alpha, torch.zeros_like(alpha))
-    return Drawn(image, alpha)
+    return Drawn(image, alpha, entries)
 
 
 def draw(
@@ -115,25 +129,6 @@ def draw(
     if len(gaussians) == 0:
         return _empty(view)
     return composite(kernels, project(kernels, gaussians, view, probe), view, mask)
-
-
-def touched_tiles(seen: Projected, view: Target) -> torch.Tensor:
-    """Return [tile rows, tile columns] bool: the tiles in which gsplat draws any of the projected Gaussians.
-
-    Corners of every box are added into a table, whose running sums then count the boxes over each tile: nothing has a
-    size that depends on values, so the processor does not wait.
-    """
-    down, across = view.tiles
-    centre = torch.where(seen.visible[:, None], seen.means2d.detach(), 0.0) / TILE
-    half = torch.where(seen.visible[:, None], seen.radii, 0) / TILE
-    # As gsplat's isect_tiles: from the tile of the lower corner to before that beyond the upper one.
-    low = (centre - half).floor().clamp_min(0).minimum(view.corner).long()
-    high = (centre + half).ceil().clamp_min(0).minimum(view.corner).long()
-    marks = torch.zeros((down + 1) * (across + 1), dtype=torch.int32, device=centre.device)
-    visible = seen.visible.int()
-    for x, y, sign in ((low, low, 1), (high, low, -1), (low, high, -1), (high, high, 1)):
-        marks.index_add_(0, y[:, 1] * (across + 1) + x[:, 0], sign * visible)
-    return marks.reshape(down + 1, across + 1).cumsum(0).cumsum(1)[:down, :across] > 0
 
 
 def pixels(mask: torch.Tensor, view: Target) -> torch.Tensor:
@@ -154,4 +149,4 @@ def _colors(kernels: Kernels, gaussians: Gaussians[torch.Tensor], view: Target, 
 
 def _empty(view: Target) -> Drawn:
     image = view.background.expand(view.height * view.width, 3).reshape(view.height, view.width, 3).clone()
-    return Drawn(image, torch.zeros_like(image[..., 0]))
+    return Drawn(image, torch.zeros_like(image[..., 0]), 0)

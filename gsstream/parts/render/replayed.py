@@ -1,0 +1,90 @@
+"""A session on a GPU whose iterations are recorded once and replayed."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, NamedTuple, Self
+
+import torch
+
+from gsstream.core.deferred import watch
+from gsstream.parts.render.replay import RecordError, Records
+from gsstream.parts.render.session import RenderSession
+from gsstream.parts.render.target import ViewTarget
+from gsstream.parts.render.transforms import Pinhole
+from gsstream.parts.render.wrt import G, LossAndGrad, Wrt
+
+
+class SeenView(NamedTuple):
+    """One view of a session: what its renderer takes from it, and its target.
+
+    ``pinhole`` is what ``ReplayedSession.numbers`` returns.
+    """
+
+    own: Any
+    pinhole: torch.Tensor
+    target: ViewTarget
+
+
+class _Asked(NamedTuple):
+    seen: SeenView
+    wrt: Any
+
+
+class ReplayedSession(RenderSession):
+    """A session that says what a view is made of, and draws a view that it is handed.
+
+    Its ``loss_and_grad`` is the default body, replayed where that can be.
+    """
+
+    #: The view that this copy of a session draws, whatever number it is asked for; None: those of the rig.
+    fixed: SeenView | None = None
+
+    @property
+    @abstractmethod
+    def records(self) -> Records | None:
+        """Records of what holds as the session is narrowed now; None: nothing can be recorded."""
+
+    @abstractmethod
+    def own(self, view: int) -> Any:
+        """Return what differs between views, in tensors; what a view needs once is made now."""
+
+    @abstractmethod
+    def numbers(self, view: int) -> torch.Tensor:
+        """Return [14] float64 on the device: rotation of a camera row by row, offset, focal lengths."""
+
+    @abstractmethod
+    def drawing(self, seen: SeenView) -> Self:
+        """Return a copy of this session that draws this one view, which is its ``fixed``."""
+
+    @abstractmethod
+    def drew_all(self) -> torch.Tensor:
+        """Return [] bool: every view that was replayed was drawn, because it fitted into what was made for it."""
+
+    @abstractmethod
+    def make_room(self) -> None:
+        """Make room for the views that did not fit."""
+
+    def seen(self, view: int, target: ViewTarget) -> SeenView:
+        """Return a view and its target, as :meth:`drawing` takes them."""
+        return SeenView(self.own(view), self.numbers(view), target)
+
+    def loss_and_grad(self, view: int, target: ViewTarget, wrt: Wrt[G]) -> LossAndGrad[G]:
+        name, records = f"gradients by {type(wrt).__name__}", None if self.fixed else self.records
+        if records is None or not records.can(name):
+            return super().loss_and_grad(view, target, wrt)
+        try:
+            found = records.call(name, self._compared, _Asked(self.seen(view, target), wrt))
+        except RecordError:
+            return super().loss_and_grad(view, target, wrt)
+        watch(records, self.drew_all, self.make_room)
+        return found
+
+    def pinhole(self, view: int) -> Pinhole:
+        if self.fixed is None:
+            return super().pinhole(view)
+        numbers = self.fixed.pinhole.unbind()
+        return Pinhole((numbers[:3], numbers[3:6], numbers[6:9]), numbers[9:12], numbers[12:])
+
+    def _compared(self, asked: _Asked) -> LossAndGrad[Any]:
+        return RenderSession.loss_and_grad(self.drawing(asked.seen), 0, asked.seen.target, asked.wrt)

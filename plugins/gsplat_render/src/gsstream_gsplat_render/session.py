@@ -1,0 +1,229 @@
+"""One scene of which some rows change, drawn by gsplat's functions, operation by operation or replayed."""
+
+from __future__ import annotations
+
+from copy import copy
+from typing import NamedTuple, final
+
+import torch
+
+from gsstream.api import Cameras, Gaussians, ShapeError
+from gsstream.backend import (
+    Records,
+    RenderOutput,
+    RenderSession,
+    ReplayedSession,
+    ScreenGradient,
+    SeenView,
+    drawn_rows,
+)
+from gsstream_gsplat_render.kernels import Kernels
+from gsstream_gsplat_render.rig import Background, Rig, Rigs, Target
+from gsstream_gsplat_render.seen import Projected
+from gsstream_gsplat_render.splat import Drawn, composite, composite_fixed, draw, pixels, project
+from gsstream_gsplat_render.tiles import Grid, boxes, covered_tiles
+
+
+class Shown(NamedTuple):
+    """A view of the session's scene: image [H, W, 3], alpha [H, W]. ``tiles``: in which the active rows are drawn."""
+
+    image: torch.Tensor
+    alpha: torch.Tensor
+    tiles: torch.Tensor
+
+
+class Own(NamedTuple):
+    """What a view is drawn from besides the rows; ``shown``: None where every row changes."""
+
+    target: Target
+    shown: Shown | None
+    grid: Grid
+
+
+@final
+class GsplatSession(ReplayedSession):
+    """One scene on the device, of which some rows change. Tiles that these rows never touch are drawn once.
+
+    Arguments:
+        kernels: gsplat's functions.
+        rigs: of the renderer, whose device they work on.
+        active: [A] rows that change, no duplicates; None: all.
+    """
+
+    def __init__(
+        self,
+        kernels: Kernels,
+        rigs: Rigs,
+        gaussians: Gaussians[torch.Tensor],
+        active: torch.Tensor | None,
+        cameras: Cameras,
+        background: Background,
+    ) -> None:
+        self._kernels, self._rigs = kernels, rigs
+        self._cameras, self._background = cameras, background
+        self._home = gaussians.means.device
+        self._scene = _moved(gaussians.map(torch.Tensor.detach), rigs.device)
+        self._active: torch.Tensor | None = None
+        self._pictures: dict[int, Drawn] = {}
+        self._tiles: dict[int, torch.Tensor] = {}
+        self._records: Records | None = None
+        if active is not None:
+            self.narrow(active)
+
+    @property
+    def cameras(self) -> Cameras:
+        return self._cameras
+
+    def render(
+        self,
+        view: int,
+        rows: Gaussians[torch.Tensor],
+        *,
+        probe: torch.Tensor | None = None,
+        tile_mask: torch.Tensor | None = None,
+    ) -> RenderOutput:
+        home, (target, shown, grid) = rows.means.device, self._own(view)
+        whole, whole_probe = self._merged(_moved(rows, self._rigs.device), probe)
+        mask = None if tile_mask is None else _checked_mask(tile_mask, target).to(self._rigs.device)
+        if len(whole) == 0:
+            drawn = draw(self._kernels, whole, target)
+            return RenderOutput(drawn.image.to(home), drawn.alpha.to(home))
+        seen = project(self._kernels, whole, target, whole_probe)
+        edges = boxes(seen, grid)
+        if shown is None:
+            drawn = self._composited(seen, edges, target, mask=mask)
+            return RenderOutput(drawn.image.to(home), drawn.alpha.to(home))
+        assert self._active is not None
+        tiles = shown.tiles | covered_tiles(edges[self._active], seen.visible[self._active], grid)
+        mask = tiles if mask is None else tiles & mask
+        drawn, inside = self._composited(seen, edges, target, mask=mask), pixels(mask, target)
+        image = torch.where(inside[..., None], drawn.image, shown.image)
+        alpha = torch.where(inside, drawn.alpha, shown.alpha)
+        return RenderOutput(image.to(home), alpha.to(home), tiles.to(home))
+
+    def visible(self, view: int, tiles: torch.Tensor) -> torch.Tensor:
+        target = self._rig[view]
+        size = self._cameras.height, self._cameras.width
+
+        def shown(scene: Gaussians[torch.Tensor]) -> RenderOutput:
+            drawn = draw(self._kernels, scene, target)
+            return RenderOutput(drawn.image, drawn.alpha)
+
+        return drawn_rows(shown, self._scene, size, tiles.to(self._rigs.device)).to(self._home)
+
+    def narrow(self, active: torch.Tensor) -> None:
+        self._active = active.to(self._rigs.device)
+        # The pictures stay, which show the scene as it is; the tiles are those of other rows.
+        self._tiles, self._records = {}, None
+
+    def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
+        return GsplatSession(
+            kernels=self._kernels,
+            rigs=self._rigs,
+            gaussians=gaussians,
+            active=None,
+            cameras=self._cameras,
+            background=self._background,
+        )
+
+    def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
+        """By a scene on black, so the background has no share in it."""
+        target = self._rigs.find(self._cameras, (0.0, 0.0, 0.0))[view]
+        if len(self._scene) == 0:
+            none = self._scene.means[:, :2].to(self._home)
+            return ScreenGradient(none, none[:, 0] > 0)
+        probe = torch.zeros_like(self._scene.means[:, :2]).requires_grad_()
+        with torch.enable_grad():
+            seen = project(self._kernels, self._scene, target, probe)
+            drawn = composite(self._kernels, seen, target)
+            (gradient,) = torch.autograd.grad(drawn.image, probe, image_gradient.to(self._rigs.device).float())
+        return ScreenGradient(gradient.to(self._home), seen.visible.to(self._home))
+
+    @property
+    def records(self) -> Records | None:
+        rig = self._rig
+        if rig.recorder is None or self._home != self._rigs.device or len(self._scene) == 0:
+            return None
+        if self._active is None:  # the scene is handed over with every call, so all sessions of the rig do the same
+            return rig.records if rig.is_measured else None
+        if self._records is None:
+            self._records = Records(rig.recorder)
+        return self._records
+
+    def own(self, view: int) -> Own:
+        return self._own(view)
+
+    def numbers(self, view: int) -> torch.Tensor:
+        return self._rig.numbers(view)
+
+    def drawing(self, seen: SeenView) -> GsplatSession:
+        drawing = copy(self)
+        drawing.fixed = seen
+        return drawing
+
+    def drew_all(self) -> torch.Tensor:
+        return self._rig.grid.fits()
+
+    def make_room(self) -> None:
+        self._rig.count(int(self._rig.grid.most))
+
+    def _own(self, view: int) -> Own:
+        if self.fixed is not None:
+            own: Own = self.fixed.own
+            return own
+        shown = None if self._active is None or len(self._scene) == 0 else self._shown_before(view)
+        return Own(self._rig[view], shown, self._rig.grid)
+
+    def _composited(
+        self, seen: Projected, edges: torch.Tensor, target: Target, mask: torch.Tensor | None = None
+    ) -> Drawn:
+        """A view, with lists of fixed size where that is what is recorded."""
+        if self.fixed is not None:
+            return composite_fixed(self._kernels, seen, target, self.fixed.own.grid, edges=edges, mask=mask)
+        drawn = composite(self._kernels, seen, target, mask)
+        self._rig.count(drawn.entries)
+        return drawn
+
+    @property
+    def _rig(self) -> Rig:
+        return self._rigs.find(self._cameras, self._background)
+
+    def _merged(
+        self, rows: Gaussians[torch.Tensor], probe: torch.Tensor | None
+    ) -> tuple[Gaussians[torch.Tensor], torch.Tensor | None]:
+        """The whole scene with these active rows, and their probe among zeros."""
+        moved = None if probe is None else probe.to(self._rigs.device)
+        if self._active is None:
+            return rows, moved
+        base, active = dict(self._scene.items()), self._active
+        whole = Gaussians(**{name: base[name].index_copy(0, active, value) for name, value in rows.items()})
+        if moved is None:
+            return whole, None
+        return whole, moved.new_zeros(len(whole), 2).index_copy(0, active, moved)
+
+    def _shown_before(self, view: int) -> Shown:
+        """The view of the session's scene, and the tiles in which the active rows are drawn in it."""
+        assert self._active is not None
+        if view not in self._tiles:
+            target, grid = self._rig[view], self._rig.grid
+            with torch.no_grad():
+                seen = project(self._kernels, self._scene, target)
+                edges = boxes(seen, grid)
+                if view not in self._pictures:
+                    self._pictures[view] = self._composited(seen, edges, target)
+                self._tiles[view] = covered_tiles(edges[self._active], seen.visible[self._active], grid)
+        drawn = self._pictures[view]
+        return Shown(drawn.image, drawn.alpha, self._tiles[view])
+
+
+def _moved(gaussians: Gaussians[torch.Tensor], device: torch.device) -> Gaussians[torch.Tensor]:
+    for name, value in gaussians.items():
+        if value.dtype != torch.float32:
+            raise ShapeError(f"{name}: expected dtype torch.float32, got {value.dtype}; convert it with .float()")
+    return gaussians.map(lambda value: value.to(device))
+
+
+def _checked_mask(mask: torch.Tensor, where: Target) -> torch.Tensor:
+    if mask.dtype != torch.bool or tuple(mask.shape) != where.tiles:
+        raise ShapeError(f"tile_mask: expected bool {list(where.tiles)}, got {mask.dtype} {list(mask.shape)}")
+    return mask

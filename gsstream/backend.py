@@ -20,6 +20,7 @@ from gsstream.parts.render.exposure import CameraExposure as CameraExposure
 from gsstream.parts.render.images import check_tiles as check_tiles
 from gsstream.parts.render.loss import Loss as Loss
 from gsstream.parts.render.replay import Recorder as Recorder
+from gsstream.parts.render.replay import RecordError as RecordError
 from gsstream.parts.render.replay import Records as Records
 from gsstream.parts.render.replay import recorder_on as recorder_on
 from gsstream.parts.render.replayed import ReplayedSession as ReplayedSession

@@ -30,7 +30,10 @@ def median(values: FloatArray) -> np.floating[Any]:
 
 
 def tensor_median(values: torch.Tensor) -> torch.Tensor:
-    """Return [] what ``np.median`` does, on the device of ``values``; ``torch.median`` would take the lower middle."""
+    """Return [...] what ``np.median`` does along the last axis of [..., n], where the values lie.
+
+    ``torch.median`` would take the lower middle.
+    """
     # Sorted, because ``kthvalue`` takes a hundred times as long where many values are equal, as most differences are.
-    ordered = values.flatten().sort().values
-    return (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2
+    ordered, number = values.sort(-1).values, values.shape[-1]
+    return (ordered[..., (number - 1) // 2] + ordered[..., number // 2]) / 2

@@ -14,8 +14,8 @@ from gsstream.parts.render.backward import backward
 from gsstream.testing.cases import World, get_case
 from gsstream.testing.compare import all_equal
 from gsstream.testing.drive import Outputs, outputs
-from gsstream.testing.pretend import DEVICE, PretendDevice
-from gsstream.testing.registry import check, kind_of
+from gsstream.testing.pretend import DEVICE, PretendDevice, PretendUnavailable, register
+from gsstream.testing.registry import Skip, check, kind_of
 
 #: Kinds whose tensors are on the device of the run. The first two are called once a frame: they may wait for a value,
 #: and bring noise from the processor's generator. The others are called in every iteration, and may do neither.
@@ -63,6 +63,10 @@ def _moved(value: Any) -> Any:
 def check_device(part: Part) -> None:
     """On another device outputs are there, with the same numbers and gradients, and nothing is copied on the way."""
     per_iteration = kind_of(part) in PER_ITERATION
+    try:
+        register()
+    except PretendUnavailable as error:
+        raise Skip(str(error)) from error
     for name in ("cloud", "moving"):
         world = get_case(name)
         want = _with_gradients(part, world, per_iteration)

@@ -5,12 +5,14 @@ a generator of the processor for a tensor of the device, numpy on one. What woul
 with the line that did it. So whether a loop stays on its device can be tested where there is none.
 
 ``torch.utils.backend_registration._setup_privateuseone_for_python_backend`` is marked experimental in torch; this file
-is its only user. A process registers the device once, when it imports this file; tensors of the processor are not
-affected.
+is its only user. A process registers the device once, when it first uses it; tensors of the processor are not
+affected. A process has one kind of accelerator for torch, and gradients on any other end in an error inside it: so
+where torch sees a GPU, this device is refused.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 import sys
 from collections import Counter
@@ -45,8 +47,23 @@ class _Module(_DummyBackendModule):
         return [torch.float16]
 
 
-_setup_privateuseone_for_python_backend(NAME, _Module())
-DEVICE = torch.device(NAME, 0)
+#: The key of torch that the name belongs to, once it is registered.
+DEVICE = torch.device("privateuseone", 0)
+
+
+@functools.cache
+def register() -> None:
+    """Give the device its name, once in a process. Raises PretendUnavailable where torch sees a GPU."""
+    if torch.cuda.is_available():
+        raise PretendUnavailable(
+            "the pretend device: expected a process in which torch sees no GPU, because it knows one kind of device at "
+            "a time; set CUDA_VISIBLE_DEVICES= (empty) for this process"
+        )
+    _setup_privateuseone_for_python_backend(NAME, _Module())
+
+
+class PretendUnavailable(RuntimeError):
+    """There is a GPU, whose gradients the pretend device would break."""
 
 
 class DeviceMismatch(RuntimeError):
@@ -92,6 +109,7 @@ class PretendDevice(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """
 
     def __init__(self) -> None:
+        register()
         super().__init__()  # type: ignore[no-untyped-call]
         self.up, self.down, self.waits = Counter[str](), Counter[str](), Counter[str]()
         self.launches = 0
@@ -121,7 +139,7 @@ _MADE: list[torch.Tensor] = []
 
 
 class PretendRecorder(Recorder):
-    """Records as a CUDA graph does: what it was called with stays, numbers are those of the recording, waits are refused.
+    """Records as a CUDA graph does: tensors stay, numbers are those of the recording, and waits are refused.
 
     What was computed while recording is overwritten, because a graph computes nothing before it is replayed.
     """

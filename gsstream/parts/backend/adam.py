@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from typing import final
 
 import torch
 
@@ -18,7 +17,6 @@ from gsstream.parts.residual.adam_state import ADAM_BETAS, ADAM_EPS, MAX_GRADIEN
 SATURATED = 1 << 15
 
 
-@final
 class ReferenceAdam(RowOptimiser):
     """A dozen torch calls per table, on its device."""
 

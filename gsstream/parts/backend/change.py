@@ -97,21 +97,28 @@ class Change:
             means: [N, 3] centres. A centre that projects into no view gets 0.
             cameras: those of the views.
         """
-        dilated = self.dilated.flatten(1)
+        # One view after another on the processor, as numbers; on a GPU all views in one go, which is queued once.
+        at_once = 1 if means.device.type == "cpu" else len(cameras)
         hits, seen = torch.zeros_like(means[:, 0]), torch.zeros_like(means[:, 0])
-        columns = -(-self.width // TILE)
-        for view in range(len(cameras)):
-            # As numbers, which go along with every operation: a matrix would be copied to the device.
-            pose, K = cameras.viewmats[view].astype("float32").tolist(), cameras.Ks[view].astype("float32").tolist()
-            x, y, z = (row[0] * means[:, 0] + row[1] * means[:, 1] + row[2] * means[:, 2] + row[3] for row in pose[:3])
-            inside = z > cameras.near_plane
-            inverse = 1 / torch.where(inside, z, 1.0)
-            u, v = K[0][0] * x * inverse + K[0][2], K[1][1] * y * inverse + K[1][2]
-            inside = inside & (u >= 0) & (v >= 0) & (u < self.width) & (v < self.height)
-            u, v = (torch.where(inside, of, 0.0) * (1 / TILE) for of in (u, v))
-            seen = seen + inside
-            hits = hits + (inside & dilated[view][v.long() * columns + u.long()])
+        for first in range(0, len(cameras), at_once):
+            views = slice(first, first + at_once)
+            inside, marked = self._found(means, cameras, views)
+            seen, hits = seen + inside.sum(0), hits + (inside & marked).sum(0)
         return hits / seen.clamp_min(1)
+
+    def _found(self, means: torch.Tensor, cameras: Cameras, views: slice) -> tuple[torch.Tensor, torch.Tensor]:
+        """[V, N] bool: whether centres project into these views, and whether in or beside a tile that changed."""
+        poses, Ks = cameras.viewmats[views, :3].astype("float32"), cameras.Ks[views, :2].astype("float32")
+        pose = torch.from_numpy(poses).to(means.device).permute(1, 2, 0)[..., None]  # [3, 4, V, 1]
+        K = torch.from_numpy(Ks).to(means.device).permute(1, 2, 0)[..., None]
+        x, y, z = (row[0] * means[:, 0] + row[1] * means[:, 1] + row[2] * means[:, 2] + row[3] for row in pose)
+        inside = z > cameras.near_plane
+        inverse = 1 / torch.where(inside, z, 1.0)
+        u, v = K[0, 0] * x * inverse + K[0, 2], K[1, 1] * y * inverse + K[1, 2]
+        inside = inside & (u >= 0) & (v >= 0) & (u < self.width) & (v < self.height)
+        u, v = (torch.where(inside, of, 0.0) * (1 / TILE) for of in (u, v))
+        columns = -(-self.width // TILE)
+        return inside, self.dilated[views].flatten(1).gather(1, v.long() * columns + u.long())
 
     def rows(self, means: torch.Tensor, cameras: Cameras, session: RenderSession, min_votes: float) -> torch.Tensor:
         """Return [N] bool: Gaussians that are drawn in a changed tile and have at least this share of votes.
@@ -134,62 +141,66 @@ def find_change(before: Sequence[torch.Tensor], now: Sequence[torch.Tensor], thr
         before, now: one image [H, W, 3] per view, float32, or uint8 of which 255 is 1.0.
         threshold: multiple of the noise of block means.
     """
-    blocks = [changed_blocks(*pair, threshold) for pair in zip(before, now, strict=True)]
     height, width = now[0].shape[:2]
-    return Change(changed_tiles(torch.stack(blocks)), height, width)
+    # One by one on the processor, whose cache holds a picture; on a GPU in one go, because it is queued that often.
+    step = 1 if now[0].device.type == "cpu" else len(now)
+    groups = [slice(at, at + step) for at in range(0, len(now), step)]
+    blocks = [changed_blocks(torch.stack(list(before[at])), torch.stack(list(now[at])), threshold) for at in groups]
+    return Change(changed_tiles(torch.cat(blocks)), height, width)
 
 
 def changed_blocks(before: torch.Tensor, now: torch.Tensor, threshold: float) -> torch.Tensor:
-    """Return [ceil(H / 4), ceil(W / 4)] bool: blocks whose mean difference exceeds the noise of block means."""
+    """Return [V, ceil(H / 4), ceil(W / 4)] bool: blocks whose mean difference exceeds the noise of block means."""
     means = block_means(_difference(before, now))
-    return (means.abs() > threshold * block_sigma(means)).any(-1)
+    return (means.abs() > threshold * block_sigma(means)[:, None, None, None]).any(-1)
 
 
 def _difference(before: torch.Tensor, now: torch.Tensor) -> torch.Tensor:
-    """[H, W, 3] float32, or int16 in levels of 8 bits where both images are stored as bytes."""
+    """[V, H, W, 3] float32, or int16 in levels of 8 bits where both images are stored as bytes."""
     if before.dtype == now.dtype == torch.uint8:
         return now.short() - before.short()
     return float_image(now) - float_image(before)
 
 
 def block_means(picture: torch.Tensor) -> torch.Tensor:
-    """Return [ceil(H / 4), ceil(W / 4), 3] float64 means of [H, W, 3]; border blocks average the pixels they have.
+    """Return [..., ceil(H / 4), ceil(W / 4), 3] float64 means of [..., H, W, 3].
 
-    Of int16 the sums are exact (they stay below 2^12), and a level is 1 / 255.
+    Border blocks average the pixels they have. Of int16 the sums are exact (they stay below 2^12), and a level is
+    1 / 255.
     """
-    sums = _sums(_sums(picture).transpose(0, 1)).transpose(0, 1).double()
+    sums = _sums(_sums(picture, -3), -2).double()
     if picture.dtype == torch.int16:
         sums = sums / 255.0
     sizes = [
         (side - torch.arange(0, side, ChangeRule.BLOCK, device=picture.device)).clamp_max(ChangeRule.BLOCK)
-        for side in picture.shape[:2]
+        for side in picture.shape[-3:-1]
     ]
     return sums / torch.outer(*sizes)[..., None]
 
 
-def _sums(rows: torch.Tensor) -> torch.Tensor:
-    """Sums over BLOCK rows each, always added in this order; the last block may have fewer."""
+def _sums(values: torch.Tensor, axis: int) -> torch.Tensor:
+    """Sums over BLOCK places each along an axis, always added in this order; the last block may have fewer."""
+    rows = values.movedim(axis, 0)
     whole = len(rows) // ChangeRule.BLOCK * ChangeRule.BLOCK
     first, second, third, fourth = (rows[i : whole : ChangeRule.BLOCK] for i in range(ChangeRule.BLOCK))
     sums = first + (second + third + fourth)
-    if whole == len(rows):
-        return sums
-    last = rows[whole : whole + 1]
-    others = rows[whole + 1 :].sum(0, keepdim=True, dtype=rows.dtype)
-    return torch.cat([sums, last + others])
+    if whole < len(rows):
+        others = rows[whole + 1 :].sum(0, keepdim=True, dtype=rows.dtype)
+        sums = torch.cat([sums, rows[whole : whole + 1] + others])
+    return sums.movedim(0, axis)
 
 
 def block_sigma(means: torch.Tensor) -> torch.Tensor:
-    """Return []: the noise of block means of a difference, image units, within its bounds."""
-    spread = MAD_TO_SIGMA * tensor_median((means - tensor_median(means)).abs())
+    """Return [...]: the noise of block means [..., rows, columns, 3] of differences, image units, within bounds."""
+    flat = means.flatten(-3)
+    spread = MAD_TO_SIGMA * tensor_median((flat - tensor_median(flat)[..., None]).abs())
+    sides = [means.movedim(axis, -1) for axis in (-3, -2)]
     seconds = [
-        (side[:-2] - 2 * side[1:-1] + side[2:]).abs().flatten()
-        for side in (means, means.transpose(0, 1))
-        if len(side) > 2
+        (side[..., :-2] - 2 * side[..., 1:-1] + side[..., 2:]).abs().flatten(-3) for side in sides if side.shape[-1] > 2
     ]
     if seconds:
         # The variance of a - 2 b + c is six times that of each.
-        admitted = ChangeRule.MOST_OF_ROUGHNESS * MAD_TO_SIGMA * tensor_median(torch.cat(seconds)) / math.sqrt(6)
+        admitted = ChangeRule.MOST_OF_ROUGHNESS * MAD_TO_SIGMA * tensor_median(torch.cat(seconds, -1)) / math.sqrt(6)
         spread = spread.minimum(admitted)
     return spread.clamp(ChangeRule.LEAST_SIGMA, ChangeRule.MOST_SIGMA)
 

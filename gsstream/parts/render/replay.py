@@ -16,7 +16,9 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
-from typing import Any, TypeVar, cast, final
+from functools import reduce
+from operator import and_
+from typing import Any, Protocol, TypeVar, cast, final
 
 import torch
 
@@ -35,12 +37,13 @@ class Recorder(ABC):
     """Records what is queued on a device.
 
     ``refused`` names what could not be recorded: it is not tried again. ``done`` holds what was recorded, whatever its
-    sizes: libraries are loaded and tables made.
+    sizes: libraries are loaded and tables made. ``is_busy``: something is being recorded, with all that it calls.
     """
 
     def __init__(self) -> None:
         self.refused: set[str] = set()
         self.done: set[object] = set()
+        self.is_busy = False
 
     @abstractmethod
     def record(self, work: Work, *, is_new: bool) -> Work:
@@ -58,7 +61,8 @@ class CudaRecorder(Recorder):
 
     def __init__(self, device: torch.device) -> None:
         super().__init__()
-        self._stream, self._pool = torch.cuda.Stream(device), torch.cuda.graph_pool_handle()
+        self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        self._pool = torch.cuda.graph_pool_handle()
 
     def record(self, work: Work, *, is_new: bool) -> Work:
         before, graph = torch.cuda.current_stream(self._stream.device), torch.cuda.CUDAGraph()
@@ -76,7 +80,20 @@ class CudaRecorder(Recorder):
                 raise
             graph.capture_end()
         before.wait_stream(self._stream)
-        return cast(Work, graph.replay)
+        return graph.replay
+
+
+class Room(Protocol):
+    """What has a fixed size in a record, and may turn out to be too small.
+
+    A replay for which it was too small left its view out; nothing it returned is wrong but for that.
+    """
+
+    def suffices(self) -> torch.Tensor:
+        """Return [] bool: it was large enough for every replay since it last grew."""
+
+    def grow(self) -> None:
+        """Have records that are made from now on find enough of it."""
 
 
 def recorder_on(device: torch.device) -> Recorder | None:
@@ -91,16 +108,17 @@ class Records:
     Arguments:
         recorder: of the device.
         keep: number of records that are kept; the one that was used longest ago makes room.
+        room: of what has a fixed size in these records; None: nothing has.
         is_watched: have checks of numbers read with the deferred ones; else :meth:`flags` are for the caller to read.
     """
 
-    def __init__(self, recorder: Recorder, keep: int = 4, *, is_watched: bool = True) -> None:
-        self.recorder, self._keep, self._is_watched = recorder, keep, is_watched
+    def __init__(self, recorder: Recorder, keep: int = 4, *, room: Room | None = None, is_watched: bool = True) -> None:
+        self.recorder, self._keep, self._room, self._is_watched = recorder, keep, room, is_watched
         self._records: OrderedDict[Any, _Record] = OrderedDict()
 
     def can(self, name: str) -> bool:
         """Say whether a function may be recorded: nothing of its name was refused, and checks are read later."""
-        return name not in self.recorder.refused and are_deferred()
+        return not self.recorder.is_busy and name not in self.recorder.refused and are_deferred()
 
     def call(self, name: str, function: Callable[[I], T], inputs: I, changed: Sequence[torch.Tensor] = ()) -> T:
         """Return what the function returns, in tensors that belong to the caller.
@@ -126,6 +144,8 @@ class Records:
         record.replay(leaves)
         if self._is_watched:
             record.watch()
+            if self._room is not None:
+                watch(self, self._room.suffices, self._room.grow)
         return cast(T, record.copied())
 
     def _record(
@@ -139,6 +159,7 @@ class Records:
         kind = name, tuple(value.dtype for value in leaves)
         kept = [value.clone() for value in changed]
         try:
+            self.recorder.is_busy = True
             made = _Record(function, form, leaves)
             made.record(self.recorder, is_new=kind not in self.recorder.done)
         except Exception as error:
@@ -150,18 +171,26 @@ class Records:
             )
             raise RecordError(said) from error
         finally:
+            self.recorder.is_busy = False
             if kept:
                 torch._foreach_copy_(list(changed), kept)
         self.recorder.done.add(kind)
         return made
 
-    def flags(self) -> list[torch.Tensor]:
-        """Return tensors [] bool: whether all checks of all replays held so far."""
-        return [record.held for record in self._records.values()]
+    def held(self) -> bool:
+        """Say whether all checks of all replays held, and there was room; waits for the device. Else, make room."""
+        flags = [record.held for record in self._records.values()]
+        if self._room is not None:
+            flags.append(self._room.suffices())
+        if bool(reduce(and_, flags)):
+            return True
+        if self._room is not None and not bool(self._room.suffices()):
+            self._room.grow()
+        return False
 
     def beside(self) -> Records:
         """Return more records of the same device, whose checks the caller reads."""
-        return Records(self.recorder, self._keep, is_watched=False)
+        return Records(self.recorder, self._keep, room=self._room, is_watched=False)
 
 
 @final
@@ -241,7 +270,7 @@ def _put(form: Any, leaves: Iterator[torch.Tensor]) -> Any:
     if kind is _Plain:
         return parts
     if kind is dict or is_dataclass(kind):
-        return kind(**{name: _put(part, leaves) for name, part in parts})
+        return cast(Any, kind)(**{name: _put(part, leaves) for name, part in parts})
     made = [_put(part, leaves) for part in parts]
     return kind(*made) if hasattr(kind, "_fields") else kind(made)
 

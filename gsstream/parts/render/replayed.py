@@ -7,7 +7,6 @@ from typing import Any, NamedTuple, Self
 
 import torch
 
-from gsstream.core.deferred import watch
 from gsstream.parts.render.replay import RecordError, Records
 from gsstream.parts.render.session import RenderSession
 from gsstream.parts.render.target import ViewTarget
@@ -57,14 +56,6 @@ class ReplayedSession(RenderSession):
     def drawing(self, seen: SeenView) -> Self:
         """Return a copy of this session that draws this one view, which is its ``fixed``."""
 
-    @abstractmethod
-    def drew_all(self) -> torch.Tensor:
-        """Return [] bool: every view that was replayed was drawn, because it fitted into what was made for it."""
-
-    @abstractmethod
-    def make_room(self) -> None:
-        """Make room for the views that did not fit."""
-
     def seen(self, view: int, target: ViewTarget) -> SeenView:
         """Return a view and its target, as :meth:`drawing` takes them."""
         return SeenView(self.own(view), self.numbers(view), target)
@@ -74,11 +65,9 @@ class ReplayedSession(RenderSession):
         if records is None or not records.can(name):
             return super().loss_and_grad(view, target, wrt)
         try:
-            found = records.call(name, self._compared, _Asked(self.seen(view, target), wrt))
+            return records.call(name, self._compared, _Asked(self.seen(view, target), wrt))
         except RecordError:
             return super().loss_and_grad(view, target, wrt)
-        watch(records, self.drew_all, self.make_room)
-        return found
 
     def pinhole(self, view: int) -> Pinhole:
         if self.fixed is None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import reduce
-from operator import and_
 from typing import Any, NamedTuple, final
 
 import torch
@@ -79,10 +77,8 @@ class ReplayedResidualOptimiser(JointResidualOptimiser):
         for place, now in enumerate(asked):
             epoch.begin(place)
             losses.append(self._records.call(name, iterate, now, tables))
-        if bool(reduce(and_, [session.drew_all(), *self._records.flags()])):
+        if self._records.held():
             return losses
-        if not bool(session.drew_all()):
-            session.make_room()
         self._records = self._records.beside()
         return None
 

@@ -39,7 +39,7 @@ class StandIn(Renderer):
 
     @property
     def optimiser(self) -> RowOptimiser:
-        return ReplayedAdam()
+        return ReplayedAdam(RIGS[self.device.type].recorder)
 
     def render(self, gaussians: Any, cameras: Any, view: int, background: Any) -> RenderOutput:
         return self.open(gaussians, None, cameras, background).render(view, gaussians)

@@ -41,7 +41,7 @@ class GsplatRenderer(Renderer):
 
     @property
     def optimiser(self) -> RowOptimiser:
-        return ReplayedAdam()
+        return ReplayedAdam(rigs_on(self.config.device).recorder)
 
     def render(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, background: Background

@@ -58,7 +58,7 @@ class Rig:
         self._numbers: dict[int, torch.Tensor] = {}
         self.recorder = recorder
         #: Of scenes of which every row changes; those of a narrowed one are its session's.
-        self.records = None if recorder is None else Records(recorder)
+        self.records = None if recorder is None else Records(recorder, room=self)
         self._entries, self._grid = 0, Grid(*tiles_of(cameras), capacity=LEAST, device=device)
 
     def __getitem__(self, view: int) -> Target:
@@ -91,6 +91,12 @@ class Rig:
     def count(self, entries: int) -> None:
         """Take note of how many entries a view needed."""
         self._entries = max(self._entries, entries)
+
+    def suffices(self) -> torch.Tensor:
+        return self._grid.most <= self._grid.capacity
+
+    def grow(self) -> None:
+        self.count(int(self._grid.most))
 
     @property
     def is_measured(self) -> bool:

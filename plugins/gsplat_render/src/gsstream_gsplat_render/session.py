@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from copy import copy
 from typing import NamedTuple, final
 
@@ -9,6 +10,7 @@ import torch
 
 from gsstream.api import Cameras, Gaussians, ShapeError
 from gsstream.backend import (
+    RecordError,
     Records,
     RenderOutput,
     RenderSession,
@@ -40,6 +42,17 @@ class Own(NamedTuple):
     grid: Grid
 
 
+class _Scatter(NamedTuple):
+    """A view, and the gradient by its image [H, W, 3]. ``grid``: None: lists are as long as they have to be."""
+
+    target: Target
+    upstream: torch.Tensor
+    grid: Grid | None
+
+
+SCATTERED = "gradients on the screen"
+
+
 @final
 class GsplatSession(ReplayedSession):
     """One scene on the device, of which some rows change. Tiles that these rows never touch are drawn once.
@@ -66,7 +79,9 @@ class GsplatSession(ReplayedSession):
         self._active: torch.Tensor | None = None
         self._pictures: dict[int, Drawn] = {}
         self._tiles: dict[int, torch.Tensor] = {}
+        #: Of what the active rows make, and of gradients on the screen, which belong to the scene.
         self._records: Records | None = None
+        self._scattered: Records | None = None
         if active is not None:
             self.narrow(active)
 
@@ -128,16 +143,33 @@ class GsplatSession(ReplayedSession):
 
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
         """By a scene on black, so the background has no share in it."""
-        target = self._rigs.find(self._cameras, (0.0, 0.0, 0.0))[view]
+        rig, place = self._rigs.find(self._cameras, (0.0, 0.0, 0.0)), self._rigs.device
         if len(self._scene) == 0:
             none = self._scene.means[:, :2].to(self._home)
             return ScreenGradient(none, none[:, 0] > 0)
+        upstream = image_gradient.to(place).float()
+        if self._scattered is None and rig.recorder is not None and self._home == place:
+            self._scattered = Records(rig.recorder, room=rig)
+        found = None
+        if self._scattered is not None and rig.is_measured and self._scattered.can(SCATTERED):
+            with suppress(RecordError):
+                found = self._scattered.call(SCATTERED, self._scatter, _Scatter(rig[view], upstream, rig.grid))
+        if found is None:
+            found = self._scatter(_Scatter(rig[view], upstream, None))
+        return ScreenGradient(found.gradient.to(self._home), found.visible.to(self._home))
+
+    def _scatter(self, asked: _Scatter) -> ScreenGradient:
+        (target, upstream, grid), rig = asked, self._rigs.find(self._cameras, (0.0, 0.0, 0.0))
         probe = torch.zeros_like(self._scene.means[:, :2]).requires_grad_()
         with torch.enable_grad():
             seen = project(self._kernels, self._scene, target, probe)
-            drawn = composite(self._kernels, seen, target)
-            (gradient,) = torch.autograd.grad(drawn.image, probe, image_gradient.to(self._rigs.device).float())
-        return ScreenGradient(gradient.to(self._home), seen.visible.to(self._home))
+            if grid is None:
+                drawn = composite(self._kernels, seen, target)
+                rig.count(drawn.entries)
+            else:
+                drawn = composite_fixed(self._kernels, seen, target, grid, edges=boxes(seen, grid))
+            (gradient,) = torch.autograd.grad(drawn.image, probe, upstream)
+        return ScreenGradient(gradient, seen.visible)
 
     @property
     def records(self) -> Records | None:
@@ -147,7 +179,7 @@ class GsplatSession(ReplayedSession):
         if self._active is None:  # the scene is handed over with every call, so all sessions of the rig do the same
             return rig.records if rig.is_measured else None
         if self._records is None:
-            self._records = Records(rig.recorder)
+            self._records = Records(rig.recorder, room=rig)
         return self._records
 
     def own(self, view: int) -> Own:
@@ -160,12 +192,6 @@ class GsplatSession(ReplayedSession):
         drawing = copy(self)
         drawing.fixed = seen
         return drawing
-
-    def drew_all(self) -> torch.Tensor:
-        return self._rig.grid.fits()
-
-    def make_room(self) -> None:
-        self._rig.count(int(self._rig.grid.most))
 
     def _own(self, view: int) -> Own:
         if self.fixed is not None:

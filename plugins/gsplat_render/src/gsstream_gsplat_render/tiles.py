@@ -48,10 +48,6 @@ class Grid:
         #: [] the largest number of entries that was asked for; more than ``capacity``: a picture was left out.
         self.most = torch.zeros((), dtype=torch.int64).to(device)
 
-    def fits(self) -> torch.Tensor:
-        """[] bool: no list was too short."""
-        return self.most <= self.capacity
-
 
 class Lists(NamedTuple):
     """``order`` [capacity] int32 rows of Gaussians, ``offsets`` [rows + 1, columns] int32 where each tile begins.

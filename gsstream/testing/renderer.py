@@ -141,7 +141,13 @@ def check_renderer_screen_gradient(part: Renderer) -> None:
     few, whole = session.screen_gradient_rows(0, weights), session.screen_gradient(0, weights).gradient
     assert bool((few.rows[1:] > few.rows[:-1]).all()), "screen_gradient_rows: rows that are not in ascending order"
     spread = torch.zeros_like(whole).index_copy(0, few.rows, few.gradient)
-    equal("screen_gradient_rows, against screen_gradient", spread, whole, tolerance=0.0, why=EXACT)
+    equal(
+        "screen_gradient_rows, against screen_gradient",
+        spread,
+        whole,
+        tolerance=1e-5,
+        why="sums that a GPU makes in no fixed order",
+    )
 
 
 @check("renderer")

@@ -63,6 +63,10 @@ class CudaRecorder(Recorder):
         super().__init__()
         self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
         self._pool = torch.cuda.graph_pool_handle()
+        # Memory that no graph holds is given back for good, so one graph stays.
+        self._keeper, kept = torch.cuda.CUDAGraph(), torch.zeros(1, device=device)
+        with torch.cuda.graph(self._keeper, pool=self._pool, stream=self._stream):
+            self._kept = kept + 1
 
     def record(self, work: Work, *, is_new: bool) -> Work:
         before, graph = torch.cuda.current_stream(self._stream.device), torch.cuda.CUDAGraph()
@@ -246,6 +250,13 @@ class _Record:
         _, error, blame = self._checks[failed[0] if failed else 0]
         found = error()
         raise blame(found) from found
+
+
+def tensors_of(value: object) -> list[torch.Tensor]:
+    """Return the tensors in dataclasses, tuples and mappings."""
+    found: list[torch.Tensor] = []
+    _take(value, found)
+    return found
 
 
 def _take(value: Any, leaves: list[torch.Tensor]) -> Any:

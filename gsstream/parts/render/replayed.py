@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from contextlib import suppress
 from typing import Any, NamedTuple, Self
 
 import torch
 
-from gsstream.parts.render.replay import RecordError, Records
+from gsstream.core.deferred import require
+from gsstream.core.errors import ShapeError
+from gsstream.parts.render.replay import RecordError, Records, tensors_of
 from gsstream.parts.render.session import RenderSession
 from gsstream.parts.render.target import ViewTarget
 from gsstream.parts.render.transforms import Pinhole
@@ -62,12 +65,11 @@ class ReplayedSession(RenderSession):
 
     def loss_and_grad(self, view: int, target: ViewTarget, wrt: Wrt[G]) -> LossAndGrad[G]:
         name, records = f"gradients by {type(wrt).__name__}", None if self.fixed else self.records
-        if records is None or not records.can(name):
-            return super().loss_and_grad(view, target, wrt)
-        try:
-            return records.call(name, self._compared, _Asked(self.seen(view, target), wrt))
-        except RecordError:
-            return super().loss_and_grad(view, target, wrt)
+        if records is not None and records.can(name):
+            with suppress(RecordError):
+                return records.call(name, self._compared, _Asked(self.seen(view, target), wrt))
+        _require_finite(wrt)
+        return super().loss_and_grad(view, target, wrt)
 
     def pinhole(self, view: int) -> Pinhole:
         if self.fixed is None:
@@ -76,4 +78,15 @@ class ReplayedSession(RenderSession):
         return Pinhole((numbers[:3], numbers[3:6], numbers[6:9]), numbers[9:12], numbers[12:])
 
     def _compared(self, asked: _Asked) -> LossAndGrad[Any]:
-        return RenderSession.loss_and_grad(self.drawing(asked.seen), 0, asked.seen.target, asked.wrt)
+        return self.drawing(asked.seen).loss_and_grad(0, asked.seen.target, asked.wrt)
+
+
+def _require_finite(wrt: Wrt[Any]) -> None:
+    """A rasteriser of a GPU leaves out rows that are not finite, without a word."""
+    by_type: dict[torch.dtype, list[torch.Tensor]] = {}
+    for value in tensors_of(wrt):
+        if value.is_floating_point() and value.numel():
+            by_type.setdefault(value.dtype, []).append(value.detach())
+    for values in by_type.values():
+        largest = torch.stack(torch._foreach_norm(values, torch.inf))
+        require(largest.isfinite().all(), lambda: ShapeError("rows: expected finite values, got one that is not"))

@@ -132,5 +132,5 @@ def _same(one: Cameras, other: Cameras) -> bool:
 @functools.cache
 def rigs_on(device: str) -> Rigs:
     """Return the rigs of a device; all renderers that work on it share them."""
-    place = torch.device(device)
+    place = torch.empty(0, device=device).device  # with its number, as tensors that lie there have it
     return Rigs(place, recorder_on(place))

@@ -141,7 +141,7 @@ class ViewSpaceGradient(ConfidenceEstimator):
         for view in range(views):
             found = context.screen_gradient_rows(view, self._upstream(context, view))
             total[found.rows] += self._scaled(context, view, found.gradient)
-            reached[found.rows] = True
+            reached.index_fill_(0, found.rows, True)
         rows = reached.nonzero()[:, 0]
         magnitude = total[rows].norm(dim=1) / max(views, 1)
         return rows, magnitude, torch.zeros_like(magnitude), torch.ones_like(rows, dtype=torch.bool)
@@ -176,7 +176,9 @@ class ViewSpaceGradient(ConfidenceEstimator):
         check_finite(f"screen gradient of view {view} at frame {context.index}", gradient)
         result = gradient.double()
         if self.config.units == "ndc":
-            result = result * result.new_tensor([context.cameras.width / 2, context.cameras.height / 2])
+            # As numbers: a tensor of them would be copied to the device, which is waited for.
+            across, down = result.unbind(1)
+            result = torch.stack([across * (context.cameras.width / 2), down * (context.cameras.height / 2)], 1)
         return result
 
     def _upstream(self, context: FrameContext, view: int) -> torch.Tensor:

@@ -2,7 +2,7 @@
 
 Importing this package is cheap: it imports neither torch nor a plugin. Its front doors are imported when they are
 named: ``gsstream.encode`` and ``gsstream.play`` for scripts; ``gsstream.api``, ``gsstream.backend``,
-``gsstream.blocks``, ``gsstream.spec`` and ``gsstream.testing`` for plugins.
+``gsstream.replay``, ``gsstream.blocks``, ``gsstream.spec`` and ``gsstream.testing`` for plugins.
 """
 
 import importlib

@@ -14,7 +14,7 @@ from gsstream.parts.render.backward import backward
 from gsstream.testing.cases import World, get_case
 from gsstream.testing.compare import all_equal
 from gsstream.testing.drive import Outputs, outputs
-from gsstream.testing.pretend import DEVICE, PretendDevice, PretendUnavailable, register
+from gsstream.testing.pretend import DEVICE, PretendDevice, PretendUnavailable, require_pretend
 from gsstream.testing.registry import Skip, check, kind_of
 
 #: Kinds whose tensors are on the device of the run. The first two are called once a frame: they may wait for a value,
@@ -64,7 +64,7 @@ def check_device(part: Part) -> None:
     """On another device outputs are there, with the same numbers and gradients, and nothing is copied on the way."""
     per_iteration = kind_of(part) in PER_ITERATION
     try:
-        register()
+        require_pretend()
     except PretendUnavailable as error:
         raise Skip(str(error)) from error
     for name in ("cloud", "moving"):

@@ -5,14 +5,13 @@ a generator of the processor for a tensor of the device, numpy on one. What woul
 with the line that did it. So whether a loop stays on its device can be tested where there is none.
 
 ``torch.utils.backend_registration._setup_privateuseone_for_python_backend`` is marked experimental in torch; this file
-is its only user. A process registers the device once, when it first uses it; tensors of the processor are not
+is its only user. A process registers the device once, when it imports this file; tensors of the processor are not
 affected. A process has one kind of accelerator for torch, and gradients on any other end in an error inside it: so
 where torch sees a GPU, this device is refused.
 """
 
 from __future__ import annotations
 
-import functools
 import math
 import sys
 from collections import Counter
@@ -24,7 +23,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
-from gsstream.backend import Recorder
+from gsstream.replay import Recorder
 
 NAME = "pretend"
 aten = torch.ops.aten
@@ -51,15 +50,19 @@ class _Module(_DummyBackendModule):
 DEVICE = torch.device("privateuseone", 0)
 
 
-@functools.cache
-def register() -> None:
-    """Give the device its name, once in a process. Raises PretendUnavailable where torch sees a GPU."""
-    if torch.cuda.is_available():
+#: Torch counts its devices at the first backward pass, so the name is given when this file is imported.
+AVAILABLE = not torch.cuda.is_available()
+if AVAILABLE:
+    _setup_privateuseone_for_python_backend(NAME, _Module())
+
+
+def require_pretend() -> None:
+    """Raise PretendUnavailable where torch sees a GPU."""
+    if not AVAILABLE:
         raise PretendUnavailable(
             "the pretend device: expected a process in which torch sees no GPU, because it knows one kind of device at "
             "a time; set CUDA_VISIBLE_DEVICES= (empty) for this process"
         )
-    _setup_privateuseone_for_python_backend(NAME, _Module())
 
 
 class PretendUnavailable(RuntimeError):
@@ -109,7 +112,7 @@ class PretendDevice(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """
 
     def __init__(self) -> None:
-        register()
+        require_pretend()
         super().__init__()  # type: ignore[no-untyped-call]
         self.up, self.down, self.waits = Counter[str](), Counter[str](), Counter[str]()
         self.launches = 0
@@ -144,6 +147,9 @@ class PretendRecorder(Recorder):
     What was computed while recording is overwritten, because a graph computes nothing before it is replayed.
     """
 
+    #: Of the last record, kernels included; views and allocations count as none.
+    operations = 0
+
     def record(self, work: Callable[[], None], *, is_new: bool) -> Callable[[], None]:
         global _TAPE
         if is_new:
@@ -155,6 +161,7 @@ class PretendRecorder(Recorder):
             tape = _TAPE
         finally:
             _TAPE = None
+        self.operations = len(tape)
         for made in _MADE:
             made.fill_(math.nan if made.is_floating_point() else 1)
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from gsstream import API_VERSION
 
 LIST = Path(__file__).with_name("public_names.json")
-DOORS = ("api", "backend", "blocks", "encode", "play", "spec", "testing")
+DOORS = ("api", "backend", "blocks", "encode", "play", "replay", "spec", "testing")
 
 
 def public_names() -> dict[str, list[str]]:

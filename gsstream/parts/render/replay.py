@@ -10,6 +10,7 @@ processor. What it takes from elsewhere than its arguments must stay where it is
 
 from __future__ import annotations
 
+import gc
 import sys
 from abc import ABC, abstractmethod
 from collections import OrderedDict
@@ -61,30 +62,55 @@ class CudaRecorder(Recorder):
 
     def __init__(self, device: torch.device) -> None:
         super().__init__()
-        self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        self._device = device
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        self._stream = torch.cuda.Stream(self._device)  # type: ignore[no-untyped-call]
         self._pool = torch.cuda.graph_pool_handle()
         # Memory that no graph holds is given back for good, so one graph stays.
-        self._keeper, kept = torch.cuda.CUDAGraph(), torch.zeros(1, device=device)
-        with torch.cuda.graph(self._keeper, pool=self._pool, stream=self._stream):
-            self._kept = kept + 1
+        one = torch.zeros(1, device=self._device)
+        self._keeper = self._captured(lambda: setattr(self, "_kept", one + 1))
 
     def record(self, work: Work, *, is_new: bool) -> Work:
-        before, graph = torch.cuda.current_stream(self._stream.device), torch.cuda.CUDAGraph()
-        self._stream.wait_stream(before)
-        with torch.cuda.stream(self._stream):
+        try:
+            return self._recorded(work, is_new=is_new)
+        except Exception:
             if is_new:
-                work()
-            # By thread, because others read and decode meanwhile and may ask for memory.
-            graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
-            try:
-                work()
-            except BaseException:
-                with suppress(RuntimeError):  # of a capture that failed, which the first error explains
-                    graph.capture_end()
                 raise
-            graph.capture_end()
+            # A kernel that is loaded during a capture can end it: what was never done in these sizes is done once.
+            self._begin_anew()
+            return self._recorded(work, is_new=True)
+
+    def _recorded(self, work: Work, *, is_new: bool) -> Work:
+        before = torch.cuda.current_stream(self._device)
+        self._stream.wait_stream(before)
+        if is_new:
+            with torch.cuda.stream(self._stream):
+                work()
+        graph = self._captured(work)
         before.wait_stream(self._stream)
         return graph.replay
+
+    def _captured(self, work: Work) -> torch.cuda.CUDAGraph:
+        graph, collects = torch.cuda.CUDAGraph(), gc.isenabled()
+        # What Python finds to be garbage meanwhile may hold another graph, and to free one ends a capture.
+        gc.disable()
+        try:
+            with torch.cuda.stream(self._stream):
+                # By thread, because others read and decode meanwhile and may ask for memory.
+                graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
+                try:
+                    work()
+                except BaseException:
+                    with suppress(RuntimeError):  # of a capture that failed, which the first error explains
+                        graph.capture_end()
+                    raise
+                graph.capture_end()
+        finally:
+            if collects:
+                gc.enable()
+        return graph
 
 
 class Room(Protocol):
@@ -212,6 +238,7 @@ class _Record:
 
     def record(self, recorder: Recorder, *, is_new: bool) -> None:
         self._replay = recorder.record(self._work, is_new=is_new)
+        self.held.fill_(True)  # of what was done once beforehand
 
     def _work(self) -> None:
         made: list[torch.Tensor] = []
@@ -246,7 +273,7 @@ class _Record:
 
     def _fail(self) -> None:
         self.held.fill_(True)
-        failed = [place for place, ok in enumerate(self._passed.tolist()) if not ok]
+        failed = [place for place, ok in enumerate(self._passed.cpu().tolist()) if not ok]
         _, error, blame = self._checks[failed[0] if failed else 0]
         found = error()
         raise blame(found) from found

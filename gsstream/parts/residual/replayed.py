@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, final
 
 import torch
 
+from gsstream.core.part import unwrapped
 from gsstream.parts.render.replay import RecordError, Records
 from gsstream.parts.render.replayed import ReplayedSession, SeenView
 from gsstream.parts.residual.optimiser import Gates, Iteration, ResidualEpoch
@@ -34,7 +35,7 @@ class ReplayedResidualOptimiser(JointResidualOptimiser):
 
     def run(self, epoch: ResidualEpoch[Any]) -> list[torch.Tensor]:
         noises = [epoch.gates.noise() for _ in epoch.iterations]
-        name, records = f"iterations with gates of {type(epoch.gates.gate).__name__}", epoch.session.records
+        name, records = f"iterations with {type(unwrapped(epoch.gates.gate)).__name__}", epoch.session.records
         is_frozen = any(now.frozen is not None for now in epoch.iterations)  # their number would be read
         if records is None or is_frozen or not records.can(name):
             return self.run_with(epoch, noises)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 from gsstream_gsplat_render.kernels import Kernels, load_kernels
-from gsstream_gsplat_render.renderer import GsplatRenderer, GsplatSession
+from gsstream_gsplat_render.renderer import GsplatRenderer
 from gsstream_gsplat_render.rig import Rigs
+from gsstream_gsplat_render.session import GsplatSession
 from torch_kernels import TORCH_KERNELS
 
 from gsstream.api import Cameras, Gaussians, PluginUnavailable, ShapeError

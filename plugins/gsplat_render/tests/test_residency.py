@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 import torch
-from resident import CPU, DEVICE, method_on
+from resident import CPU, DEVICE, SAME_BITS, method_on
 
 from gsstream.core.errors import ComponentError
 from gsstream.core.frame import Frame
@@ -24,7 +24,7 @@ from gsstream.engine.step import frame_step
 from gsstream.input.recordings.open import open_source
 from gsstream.parts.motion.newton import DampedNewton
 from gsstream.parts.render.loss import ReferenceLoss
-from gsstream.parts.residual.reference import JointResidualOptimiser
+from gsstream.parts.render.replay import Records
 from gsstream.testing.method_driver import SOURCE
 from gsstream.testing.pretend import PretendDevice
 
@@ -34,18 +34,23 @@ pytestmark = pytest.mark.skipif(
 COUNTS = Path(__file__).parents[3] / "docs" / "results" / "data" / "gpu.jsonl"
 
 
-def on_the_page(what: str) -> tuple[tuple[int, ...], int | None]:
-    """Copies up, copies down and waits, and the kernels, as the page of results has them."""
+def on_the_page(what: str) -> dict[str, int]:
+    """A row of the page of results."""
     rows = map(json.loads, COUNTS.read_text(encoding="utf-8").splitlines())
-    row = next(row for row in rows if row["what"].startswith(what))
-    return (row["copies_up"], row["copies_down"], row["waits"]), row.get("kernels")
+    found: dict[str, int] = next(row for row in rows if row["what"].startswith(what))
+    return found
 
 
-#: Of one iteration; each of gsplat's five kernels counts once, its gradient not at all.
-RESIDENT, LAUNCHES = on_the_page("one iteration of a later frame")
-MADE_ONCE, _ = on_the_page("once a pass over the cameras of frame 0")
+def crossings(what: str) -> tuple[int, ...]:
+    """Copies up, copies down and waits."""
+    row = on_the_page(what)
+    return row["copies_up"], row["copies_down"], row["waits"]
+
+
+RESIDENT = crossings("one iteration of a later frame")
+MADE_ONCE = crossings("once a pass over the cameras of frame 0")
 #: Of a whole later frame: its pictures and the decoded change go up, the solution comes down.
-FRAME, _ = on_the_page("a whole later frame")
+FRAME = crossings("a whole later frame")
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +74,26 @@ def counted(log: PretendDevice, cls: type, name: str, patch: pytest.MonkeyPatch)
 
 def between(marks: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
     return [tuple(b - a for a, b in zip(one, other, strict=True)) for one, other in pairwise(marks)]
+
+
+def replayed(log: PretendDevice, patch: pytest.MonkeyPatch) -> tuple[dict[str, list[tuple[int, ...]]], dict[str, int]]:
+    """What has crossed when each replayed call begins, by name, and the operations of its largest record."""
+    calls: dict[str, list[tuple[int, ...]]] = {}
+    sizes: dict[str, int] = {}
+    call, record = Records.call, Records._record
+
+    def marked(self: Records, name: str, *args: Any, **kwargs: Any) -> Any:
+        calls.setdefault(name, []).append((*log.crossings, log.launches))
+        return call(self, name, *args, **kwargs)
+
+    def measured(self: Records, name: str, *args: Any, **kwargs: Any) -> Any:
+        made = record(self, name, *args, **kwargs)
+        sizes[name] = max(sizes.get(name, 0), self.recorder.operations)
+        return made
+
+    patch.setattr(Records, "call", marked)
+    patch.setattr(Records, "_record", measured)
+    return calls, sizes
 
 
 def packets_of(frames: list[Frame], device: torch.device = CPU, name: str = "s2gs-fast") -> list[bytes]:
@@ -108,14 +133,21 @@ def test_a_later_frame_and_its_motion_stay_there_and_packets_are_those_of_the_pr
         step = method.begin(frames[0])
         packets = [step.packet.data]
         for frame in frames[1:]:
-            iterations = counted(log, JointResidualOptimiser, "forward", monkeypatch)
+            calls, sizes = replayed(log, monkeypatch)
             motion = counted(log, DampedNewton, "step", monkeypatch)
             before = log.crossings
             step = method.step(step.state, frame)
             crossed = tuple(b - a for a, b in zip(before, log.crossings, strict=True))
+            iterations = next(marks for name, marks in calls.items() if name.startswith("iterations"))
             *exact, launches = between(iterations)[-1]
             assert tuple(exact) == RESIDENT, (log.up, log.down, log.waits)
-            assert launches <= LAUNCHES
+            assert launches <= on_the_page("one iteration of a later frame")["launches"]
+            for name, row in (
+                ("iterations", "one iteration of a later frame"),
+                ("gradients by", "one iteration of motion"),
+            ):
+                most = max(size for kind, size in sizes.items() if kind.startswith(name))
+                assert 0 < most <= on_the_page(row)["operations"], (name, sizes)
             assert between(motion)[-1][:3] == RESIDENT, (log.up, log.down, log.waits)
             assert all(map(int.__le__, crossed, FRAME)), (crossed, log.up, log.down, log.waits)
             packets.append(step.packet.data)
@@ -123,6 +155,7 @@ def test_a_later_frame_and_its_motion_stay_there_and_packets_are_those_of_the_pr
     assert len(set(packets)) == len(frames)
 
 
+@SAME_BITS
 @pytest.mark.parametrize("name", ["s2gs-paper", "dense", "hicom"])
 def test_other_methods_write_the_packets_of_the_processor(frames: list[Frame], name: str) -> None:
     with PretendDevice():

@@ -121,7 +121,9 @@ def rasterize(
             opaque.append(1 - after)
         image.append(torch.cat(pictures, 1))
         alpha.append(torch.cat(opaque, 1))
-    return torch.cat(image)[None], torch.cat(alpha)[None, ..., None]
+    # As of the kernel, gradients are zero and not missing where nothing is drawn.
+    nothing = sum(value[:, :0].sum() for value in (means2d, conics, colors, opacities))
+    return torch.cat(image)[None] + nothing, torch.cat(alpha)[None, ..., None] + nothing
 
 
 def _tile(

@@ -100,7 +100,13 @@ def test_curvature_is_how_far_rows_go_on_the_screen_times_what_holds_them_there(
         return transformed64(base, moves._replace(translation=moves.translation + along[:, :3], rotation=along[:, 3:]))
 
     now = moved(0.0)
-    given = torch.from_numpy(now), moves.map(torch.from_numpy), case.cameras, Pinhole.of(case.cameras, 1), torch.from_numpy(structure)
+    given = (
+        torch.from_numpy(now),
+        moves.map(torch.from_numpy),
+        case.cameras,
+        Pinhole.of(case.cameras, 1),
+        torch.from_numpy(structure),
+    )
     curvature = curvature_of(*given).numpy()
     step = (places(moved(1e-5), case, 1) - places(moved(-1e-5), case, 1)) / 2e-5
     held = np.einsum("ai,aij,aj->a", step, tensors, step)

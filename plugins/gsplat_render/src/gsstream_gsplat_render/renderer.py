@@ -13,7 +13,8 @@ import torch
 from pydantic import Field
 
 from gsstream.api import Cameras, Gaussians, PartConfig
-from gsstream.backend import Renderer, RenderOutput, RenderSession, ReplayedAdam, RowOptimiser
+from gsstream.backend import Renderer, RenderOutput, RenderSession, RowOptimiser
+from gsstream.replay import ReplayedAdam
 from gsstream_gsplat_render.kernels import load_kernels
 from gsstream_gsplat_render.rig import Background, rigs_on
 from gsstream_gsplat_render.session import GsplatSession

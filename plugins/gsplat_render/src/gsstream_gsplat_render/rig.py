@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from gsstream.api import Cameras
-from gsstream.backend import Recorder, Records, recorder_on
+from gsstream.replay import Recorder, Records, recorder_on
 from gsstream_gsplat_render.tiles import TILE, Grid
 
 Background = tuple[float, float, float]

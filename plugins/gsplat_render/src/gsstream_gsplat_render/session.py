@@ -9,16 +9,8 @@ from typing import NamedTuple, final
 import torch
 
 from gsstream.api import Cameras, Gaussians, ShapeError
-from gsstream.backend import (
-    RecordError,
-    Records,
-    RenderOutput,
-    RenderSession,
-    ReplayedSession,
-    ScreenGradient,
-    SeenView,
-    drawn_rows,
-)
+from gsstream.backend import RenderOutput, RenderSession, ScreenGradient, drawn_rows
+from gsstream.replay import RecordError, Records, ReplayedSession, SeenView
 from gsstream_gsplat_render.kernels import Kernels
 from gsstream_gsplat_render.rig import Background, Rig, Rigs, Target
 from gsstream_gsplat_render.seen import Projected

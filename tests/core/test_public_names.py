@@ -17,14 +17,16 @@ DOORS = ("api", "backend", "blocks", "encode", "play", "replay", "spec", "testin
 
 
 def public_names() -> dict[str, list[str]]:
-    """Return door -> the names that it exports."""
+    """Return door -> the names that it exports: those of its ``__all__``, or where it has none all that it defines."""
     found = {}
     for door in DOORS:
         module = importlib.import_module(f"gsstream.{door}")
+        listed = getattr(module, "__all__", vars(module))
         found[door] = sorted(
             name
             for name, value in vars(module).items()
-            if not name.startswith("_")
+            if name in listed
+            and not name.startswith("_")
             and type(value).__name__ != "module"
             and name != "annotations"
             and (getattr(value, "__module__", "gsstream") or "").startswith("gsstream")

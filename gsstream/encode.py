@@ -27,7 +27,7 @@ import itertools
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 from gsstream.core.cameras import Cameras as Cameras
 from gsstream.core.errors import EndOfRecording, InputError
@@ -36,6 +36,7 @@ from gsstream.core.world import rig_similarity, snap_cameras
 from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.assembly.assemble import Assembly as Assembly
 from gsstream.engine.assembly.assemble import assemble
+from gsstream.engine.assembly.slots import Parts as Parts
 from gsstream.engine.frame0.points import gather_points
 from gsstream.engine.run.encoder import Callbacks as Callbacks
 from gsstream.engine.run.encoder import EncodedFrame as EncodedFrame
@@ -44,17 +45,7 @@ from gsstream.engine.run.recording import open_recording as _open
 from gsstream.input.recordings.base import Source as Source
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.input.recordings.canonical import CanonicalSource, recording_similarity
-from gsstream.method.base import StreamingMethod
 from gsstream.packet import StreamWriter as StreamWriter
-from gsstream.parts.backend.base import Renderer
-from gsstream.parts.confidence.base import ConfidenceEstimator
-from gsstream.parts.gate.base import GateSampler
-from gsstream.parts.growth.base import Growth
-from gsstream.parts.motion.base import MotionPart
-from gsstream.parts.propagation.base import Propagation
-from gsstream.parts.regularizer.base import Regularizer
-from gsstream.parts.structure.base import Structure
-from gsstream.parts.update.base import UpdateRule
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import Recipe as Recipe
 
@@ -69,21 +60,6 @@ __all__ = [
 
 def __dir__() -> list[str]:
     return __all__
-
-
-class Parts(TypedDict, total=False):
-    """Slot -> part: a part that was made already, or the name of a part, made from its values in ``settings``."""
-
-    structure: Structure | str
-    confidence: ConfidenceEstimator | str
-    propagation: Propagation | str
-    gate: GateSampler | str
-    motion: MotionPart | str
-    update: UpdateRule | str
-    growth: Growth | str
-    regularizer: Regularizer | str
-    streaming_method: StreamingMethod[Any] | str
-    renderer: Renderer | str
 
 
 def recipe_for(method: str, settings: Mapping[str, Any] | None = None) -> Recipe:

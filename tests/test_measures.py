@@ -26,7 +26,7 @@ KINDS = 11
 #: Names of the front doors that plugins import from.
 PUBLIC_NAMES = 125
 #: Files of the product that name one kind of part, growth, outside of the rooms of that kind.
-NAMING_A_KIND = 13
+NAMING_A_KIND = 9
 #: Downcasts, and protocols that are asked for while the program runs, in the engine and in what comes in.
 DOWNCASTS = 0
 #: Tables that the formatter leaves alone.

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
+from gsstream.core.kinds import FITTING_SLOTS
 
 if TYPE_CHECKING:
     from gsstream.discovery.catalog import Catalog
     from gsstream.testing.kit import CheckResult
 
 MARKS = {"passed": "✓", "failed": "✗", "warning": "⚠", "expected failure": "⚠", "skipped": "⚠"}
-#: Kinds whose parts keep every promise and may still spoil the picture.
-MEASURED = ("motion", "growth")
 
 
 @dataclass(frozen=True)
@@ -136,7 +135,7 @@ def _subjects(catalog: Catalog, name: str, source: str | None, settings: list[st
                 yield Subject(heading, skip_checks(kind, part, str(error)), absent=True)
             else:
                 results = run_checks(built)
-                sound = kind in MEASURED and all(result.ok for result in results)
+                sound = kind in FITTING_SLOTS and all(result.ok for result in results)
                 yield Subject(heading, results, effect=effect(kind, built) if sound else "")
 
 

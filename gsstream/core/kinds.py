@@ -3,7 +3,7 @@
 A new kind is one entry here, a room with its contract class, a module of its name in ``gsstream.testing`` with the
 checks of the kind and a ``BEHAVIOUR`` for the common checks, and a module of its name in ``gsstream.testing.examples``
 with the part that new plugins start from (``use``). A kind that is a slot also gets a field of its name in
-``recipe.model.Recipe`` and ``engine.assembly.assemble.Assembly``.
+``recipe.model.Recipe`` and ``engine.assembly.slots``.
 """
 
 from __future__ import annotations
@@ -28,6 +28,9 @@ class PartKind:
     #: The common checks of behaviour (purity, shapes, precision, permutation) are made on it, beside those of
     #: settings and declaration, which every kind with a contract gets.
     behaviour: bool = False
+    #: The part fits changes of the scene by itself, in passes that a budget may make fewer: a frame has a phase of the
+    #: kind's name for them, and a part that keeps every promise may still spoil the picture.
+    fits: bool = False
     #: The options by which a run names such a part, with <name> and <kind>; None: the engine chooses, so a plugin
     #: author has nothing to start from.
     use: str | None = "--set <kind>=<name> --source demo"
@@ -50,9 +53,9 @@ _KINDS = (
         "propagation", "gsstream.parts.propagation.base:Propagation", slot=True, default="group-max", behaviour=True
     ),
     PartKind("gate", "gsstream.parts.gate.base:GateSampler", slot=True, default="always-open", behaviour=True),
-    PartKind("motion", "gsstream.parts.motion.base:MotionPart", slot=True, default="still"),
+    PartKind("motion", "gsstream.parts.motion.base:MotionPart", slot=True, default="still", fits=True),
     PartKind("update", "gsstream.parts.update.base:UpdateRule", slot=True, default="additive"),
-    PartKind("growth", "gsstream.parts.growth.base:Growth", slot=True, default="none"),
+    PartKind("growth", "gsstream.parts.growth.base:Growth", slot=True, default="none", fits=True),
     PartKind("regularizer", "gsstream.parts.regularizer.base:Regularizer", slot=True, default="none", behaviour=True),
     PartKind("streaming_method", "gsstream.method.base:StreamingMethod", default="parts"),
     PartKind(
@@ -65,5 +68,7 @@ _KINDS = (
 PART_KINDS: Mapping[str, PartKind] = MappingProxyType({kind.name: kind for kind in _KINDS})
 #: Slots of a method that is made of parts.
 METHOD_SLOTS = tuple(name for name, kind in PART_KINDS.items() if kind.slot)
+#: Slots whose parts fit changes of the scene by themselves.
+FITTING_SLOTS = tuple(name for name, kind in PART_KINDS.items() if kind.fits)
 #: Kind -> "module:Class" of its contract, for the kinds that have one.
 CONTRACTS: Mapping[str, str] = MappingProxyType({kind.name: kind.contract for kind in _KINDS if kind.contract})

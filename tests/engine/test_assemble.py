@@ -14,8 +14,9 @@ from gsstream.core.part import Part
 from gsstream.discovery.builtin import gsstream_components
 from gsstream.discovery.catalog import Catalog, load_catalog
 from gsstream.discovery.discovery import Discovered
-from gsstream.engine.assembly.assemble import SLOTS, Assembly, assemble
+from gsstream.engine.assembly.assemble import Assembly, assemble
 from gsstream.engine.assembly.choose_renderer import SlowRendererWarning
+from gsstream.engine.assembly.slots import SLOTS
 from gsstream.engine.assembly.title import title
 from gsstream.parts.backend.reference import ReferenceRenderer
 from gsstream.recipe.load import ResolvedRecipe, resolve_recipe

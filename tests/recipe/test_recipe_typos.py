@@ -13,7 +13,8 @@ from pydantic import BaseModel
 
 from gsstream.core.errors import RecipeError
 from gsstream.discovery.catalog import load_catalog
-from gsstream.engine.assembly.assemble import SLOTS, assemble
+from gsstream.engine.assembly.assemble import assemble
+from gsstream.engine.assembly.slots import SLOTS
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import ComponentRef, Recipe
 

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 from gsstream.core.errors import InputError, UnknownName
-from gsstream.core.kinds import METHOD_SLOTS, PART_KINDS
+from gsstream.core.kinds import PART_KINDS
 from gsstream.core.part import Part, unwrapped
 from gsstream.discovery.catalog import Catalog
 from gsstream.engine.assembly.checks import Checks, requested_checks
@@ -17,34 +17,23 @@ from gsstream.engine.assembly.choose_renderer import Chosen, choose_renderer, co
 from gsstream.engine.assembly.fault import Where
 from gsstream.engine.assembly.guard import guard
 from gsstream.engine.assembly.recipe_keys import unused_keys
+from gsstream.engine.assembly.slots import SLOTS, LiveParts
 from gsstream.engine.assembly.title import title
-from gsstream.method.base import StreamingMethod
-from gsstream.parts.backend.base import Renderer
-from gsstream.parts.confidence.base import ConfidenceEstimator
-from gsstream.parts.gate.base import GateSampler
-from gsstream.parts.growth.base import Growth
-from gsstream.parts.motion.base import MotionPart
-from gsstream.parts.propagation.base import Propagation
-from gsstream.parts.regularizer.base import Regularizer
-from gsstream.parts.structure.base import Structure
-from gsstream.parts.update.base import UpdateRule
 from gsstream.recipe.check import join_problems, validate
 from gsstream.recipe.document import KeyPath, Origin
 from gsstream.recipe.load import ResolvedRecipe
 from gsstream.recipe.model import ComponentRef, Recipe
 from gsstream.spec import ComponentSpec
 
-SLOTS = (*METHOD_SLOTS, "streaming_method", "renderer")
 BLACK = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Assembly:
+class Assembly(LiveParts):
     """The live parts of a run.
 
     Arguments:
         recipe: the recipe with every part's parameters written out and the renderer that was chosen.
-        streaming_method: what goes from frame to frame: the parts above, or a method that is built otherwise.
         origins: path -> origin of every value that is not a default (for ``recipe.save.save_resolved``).
         distributions: installed distributions that the parts come from.
         checks: how closely the run looks at what parts return; nothing that is sent depends on it.
@@ -58,16 +47,6 @@ class Assembly:
     """
 
     recipe: Recipe
-    structure: Structure
-    confidence: ConfidenceEstimator
-    propagation: Propagation
-    gate: GateSampler
-    motion: MotionPart
-    update: UpdateRule
-    growth: Growth
-    regularizer: Regularizer
-    streaming_method: StreamingMethod[Any]
-    renderer: Renderer
     origins: Mapping[KeyPath, Origin] = field(default_factory=dict)
     distributions: tuple[str, ...] = ()
     checks: Checks = Checks.FRAME

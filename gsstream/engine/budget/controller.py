@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
+from gsstream.core.kinds import FITTING_SLOTS
 from gsstream.core.log import FrameLog
 from gsstream.engine.budget.plan import WINDOW, Past, plan, read_past_frame, unlimited
 from gsstream.method.base import Step
@@ -69,7 +70,7 @@ class Controller:
         known = actual if allowed.is_limited else ("memory",)
         limits = {name: limit for name in known if (limit := getattr(self.budget, name)) is not None}
         if allowed.is_limited and (numbers.get("iterations") or "budget" in numbers):
-            used = {**(numbers.get("budget") or _phases(step, allowed, log)), "parts": log.seconds("motion", "growth")}
+            used = {**(numbers.get("budget") or _phases(step, allowed, log)), "parts": log.seconds(*FITTING_SLOTS)}
             entry = spent(allowed, used, self._stream, numbers.get("iterations", 0) / views)
             entry["usage"]["seconds"] = seconds
         entry["limits"] = limits
@@ -105,7 +106,7 @@ def _phases(step: Step[Any], allowed: FrameBudget, log: FrameLog) -> dict[str, A
 def spent(plan: FrameBudget, used: Mapping[str, Any], stream: Stream, epochs: float) -> dict[str, Any]:
     """Return the entry ``budget`` of a frame, before its limits and the cost of the whole frame are added.
 
-    ``used`` is that of :meth:`EpochScheduler.usage`, with the seconds of motion and growth as ``parts``; ``stream``
+    ``used`` is that of :meth:`EpochScheduler.usage`, with the seconds of what fits by itself as ``parts``; ``stream``
     holds the recipe's own settings, from which the plan departed.
     """
     reduced: dict[str, Any] = {}

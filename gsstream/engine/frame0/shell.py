@@ -10,7 +10,6 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.engine.frame0.optimise import isotropic
 from gsstream.input.seeds.shell import find_shell, shell_points
-from gsstream.parts.growth.fitting import concat_gaussians
 
 #: Opacity of a seed of the shell.
 OPACITY = 0.9
@@ -25,4 +24,5 @@ def with_shell(
     positions, colors = torch.from_numpy(points.xyz), torch.from_numpy(points.rgb)
     sphere = isotropic(positions, colors, scales, opacity=OPACITY, higher=start.shN.shape[1])
     coarsest = torch.full((len(points),), int(levels.min()), dtype=levels.dtype)
-    return concat_gaussians(start, sphere), torch.cat([levels, coarsest])
+    both = {name: torch.cat([value, getattr(sphere, name)]) for name, value in start.items()}
+    return Gaussians(**both), torch.cat([levels, coarsest])

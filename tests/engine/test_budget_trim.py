@@ -71,9 +71,9 @@ def test_a_packet_never_exceeds_a_feasible_size(seed: int, share: float, spread:
     assert fitted.untrimmed == whole
     if whole <= limit:
         assert fitted.delta is delta
-        assert fitted.given_up(layout) == {"symbols": 0, "gates": 0, "added": 0}
+        assert fitted.given_up() == {"symbols": 0, "gates": 0, "added": 0}
         return
-    assert sum(fitted.given_up(layout).values()) > 0
+    assert sum(fitted.given_up().values()) > 0
     if fitted.delta.is_empty:
         return
     # What was decided is what is sent: the packet decodes to it.
@@ -119,7 +119,7 @@ def test_births_go_when_nothing_else_helps() -> None:
     encode = encoder(layout)
     plain = trim_to_size(delta, encode(delta), curvature, layout, encode, 400)
     assert plain.delta.added is None
-    assert plain.given_up(layout)["added"] == 40
+    assert plain.given_up()["added"] == 40
     assert len(plain.packet.data) <= 400
 
 
@@ -131,7 +131,7 @@ def test_a_motion_stays_while_symbols_go_and_goes_last_of_all() -> None:
     encode = encoder(layout)
     fitted = trim_to_size(delta, encode(delta), curvature, layout, encode, len(encode(delta).data) // 2)
     assert fitted.delta.motions == (motion,)
-    assert fitted.given_up(layout)["symbols"] > 0
+    assert fitted.given_up()["symbols"] > 0
     assert trim_to_size(delta, encode(delta), curvature, layout, encode, 16).delta.is_empty
 
 
@@ -141,7 +141,7 @@ def test_an_empty_packet_is_the_last_resort() -> None:
     fitted = trim_to_size(delta, encode(delta), curvature, layout, encode, 16)
     assert fitted.delta.is_empty
     assert len(fitted.packet.data) == 16
-    assert fitted.given_up(layout)["gates"] == np.count_nonzero(delta.residual.gates)
+    assert fitted.given_up()["gates"] == np.count_nonzero(delta.residual.gates)
 
 
 @given(st.integers(0, 10_000), st.sampled_from([0.05, 1.0, 20.0]), st.floats(1e-6, 1e3))

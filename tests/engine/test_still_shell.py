@@ -16,7 +16,7 @@ from gsstream.core.log import FrameLog
 from gsstream.core.rng import Rng
 from gsstream.encode import Encoder, encoder_for, open_recording
 from gsstream.engine.step.context import EngineContext
-from gsstream.input.seeds.shell import SEEDS, in_shell
+from gsstream.input.seeds.shell import SEEDS, find_shell, in_shell
 from gsstream.packet import PlayerState
 from gsstream.parts.growth.base import Growth
 from gsstream.parts.growth.copying import high_gradient_rows
@@ -46,7 +46,7 @@ def encoded(method: str, settings: dict[str, Any], number: int = 4, **parts: Any
 
 
 def shell_of(player: PlayerState) -> np.ndarray:
-    return in_shell(player.gaussians.means, player.gaussians.scales, player.meta.train)
+    return in_shell(player.gaussians.means, player.gaussians.scales, find_shell(player.meta.train))
 
 
 def rows_of(player: PlayerState, rows: np.ndarray) -> set[bytes]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
@@ -15,7 +16,7 @@ from gsstream.discovery.catalog import Catalog
 from gsstream.engine.assembly.checks import Checks, requested_checks
 from gsstream.engine.assembly.choose_renderer import Chosen, choose_renderer, construct
 from gsstream.engine.assembly.fault import Where
-from gsstream.engine.assembly.guard import guard
+from gsstream.engine.assembly.guard import error_context, guard
 from gsstream.engine.assembly.recipe_keys import unused_keys
 from gsstream.engine.assembly.slots import SLOTS, LiveParts
 from gsstream.engine.assembly.title import title
@@ -63,6 +64,13 @@ class Assembly(LiveParts):
         """Return the part of a slot itself, without its guard."""
         part: Part = unwrapped(getattr(self, slot))
         return part
+
+    def blame(self, slot: str) -> AbstractContextManager[None]:
+        """Return a context in which errors are those of the part of a slot: they name it, the frame and the iteration.
+
+        Raises ComponentError, as :func:`gsstream.engine.assembly.guard.error_context` says.
+        """
+        return error_context(slot, self.part(slot), self.where)
 
     @property
     def resolved(self) -> ResolvedRecipe:

@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 
-from gsstream.core.changes import Layout
 from gsstream.engine.budget.plan import (
     MAX_TRIMMED,
     MAX_WEIGHT,
@@ -112,7 +111,7 @@ class EpochScheduler:
         last = self._weights[len(self._weights) // 2 :] or [self.rd_lambda]
         return math.exp(sum(map(math.log, last)) / len(last)) if min(last) > 0 else self.rd_lambda
 
-    def usage(self, fitted: TrimmedDelta, layout: Layout) -> dict[str, Any]:
+    def usage(self, fitted: TrimmedDelta) -> dict[str, Any]:
         """Return what the optimisation used, and what fitting its packet gave up: raw numbers for the log."""
         return {
             "rd_lambda": self.mean_rate_weight,
@@ -121,7 +120,7 @@ class EpochScheduler:
             "untrimmed": fitted.untrimmed,
             "before": self.before,
             "optimise": self.optimise,
-            "dropped": fitted.given_up(layout),
+            "dropped": fitted.given_up(),
         }
 
     def _left(self) -> float:

@@ -34,18 +34,20 @@ class TrimmedDelta:
         packet: its packet.
         whole: what was asked for.
         untrimmed: bytes of the packet of ``whole``.
+        layout: of the scene before it.
     """
 
     delta: Delta
     packet: EncodedPacket
     whole: Delta
     untrimmed: int
+    layout: Layout
 
-    def given_up(self, layout: Layout) -> dict[str, int]:
+    def given_up(self) -> dict[str, int]:
         """Count the symbols that are not as they were, the open gates and the added Gaussians that are not sent."""
         counts = [{"gates": _open(delta), "added": _added(delta)} for delta in (self.whole, self.delta)]
         closed = {name: counts[0][name] - counts[1][name] for name in counts[0]}
-        return {"symbols": _changed(self.whole, self.delta, layout), **closed}
+        return {"symbols": _changed(self.whole, self.delta, self.layout), **closed}
 
 
 def trim_to_size(
@@ -59,7 +61,7 @@ def trim_to_size(
     """Return the delta, with as little given up as makes its packet fit; unchanged when it fits already."""
     untrimmed = len(packet.data)
     if untrimmed <= max_bytes:
-        return TrimmedDelta(delta, packet, delta, untrimmed)
+        return TrimmedDelta(delta, packet, delta, untrimmed, layout)
     able = delta.residual is not None and delta.residual.symbols
     found = _trimmed(delta, packet, curvature, layout=layout, encode=encode, max_bytes=max_bytes) if able else None
     if found is None and delta.has_row_edit:
@@ -70,7 +72,7 @@ def trim_to_size(
     if found is None:
         found = Delta(), encode(Delta())
     assert len(found[1].data) <= max_bytes, "an empty packet is above the budget"
-    return TrimmedDelta(*found, delta, untrimmed)
+    return TrimmedDelta(*found, delta, untrimmed, layout)
 
 
 def _trimmed(

@@ -17,12 +17,12 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.assembly.guard import error_context
 from gsstream.engine.frame0.first_layer import first_layer_mask
 from gsstream.engine.frame0.optimise import initial_gaussians, optimise_first_frame, sort_by_node
 from gsstream.engine.frame0.rd_quantise import rd_quantise
 from gsstream.engine.frame0.shell import with_shell
 from gsstream.engine.state.stream_state import Step, StreamState
+from gsstream.input.seeds.shell import Shell, find_shell
 from gsstream.input.seeds.thinning import thin_points
 from gsstream.method.tools import Tools
 from gsstream.packet import EncodedPacket, KeyState, PlayerState, StreamMeta, decode_packet, encode_key, quantise_key
@@ -107,7 +107,7 @@ def sort_into_nodes(
 ) -> tuple[Hierarchy, torch.Tensor, Gaussians[torch.Tensor]]:
     """Group the Gaussians and store them node by node: (hierarchy, levels, Gaussians), all in the new order."""
     hierarchy = assembly.structure.build(gaussians, anchors)
-    with error_context("structure", assembly.part("structure"), assembly.where):
+    with assembly.blame("structure"):
         hierarchy.validate()
     edit = sort_by_node(hierarchy.node_of)
     return hierarchy.rows(edit.source), levels[edit.source], gaussians.rows(edit.source)
@@ -145,8 +145,14 @@ def key_state(
         decoders=decoders,
         exposure=exposure_from_meta(player.meta),
         key_frame=player.frame,
+        shell=shell_behind(assembly, player),
     )
     return state, replace(packet, decoded=player)
+
+
+def shell_behind(assembly: Assembly, player: PlayerState) -> Shell | None:
+    """Return the sphere behind the scene of a stream; None where the recipe has none."""
+    return find_shell(player.meta.train) if assembly.recipe.first_frame.shell else None
 
 
 def key_meta(meta: StreamMeta, exposure: Exposure | None, origin: torch.Tensor) -> StreamMeta:

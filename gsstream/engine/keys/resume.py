@@ -13,7 +13,7 @@ from gsstream.core.errors import OutputError, PacketError
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.frame0.begin import decoded_anchors, exposure_from_meta
+from gsstream.engine.frame0.begin import decoded_anchors, exposure_from_meta, shell_behind
 from gsstream.engine.frame0.refine import SHOWN, advance_refinement, is_refining, start_refinement
 from gsstream.engine.state.stream_state import Refinement, StreamState, next_state
 from gsstream.input.recordings.base import SourceInfo
@@ -125,6 +125,7 @@ def key_state_from_player(assembly: Assembly, player: PlayerState, rng: Rng) -> 
         decoders=decoders,
         exposure=exposure_from_meta(player.meta),
         key_frame=player.frame,
+        shell=shell_behind(assembly, player),
     )
 
 

@@ -12,7 +12,6 @@ from gsstream.core.frame import Frame
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.assembly.fault import fault
-from gsstream.engine.assembly.guard import error_context
 from gsstream.engine.frame0.begin import check_cameras
 from gsstream.engine.run.parts_method import PartsMethod
 from gsstream.engine.run.player_difference import difference_between
@@ -49,9 +48,9 @@ def run_frame(method: StreamingMethod[Any], state: Any, frame: Frame, tools: Run
     """
 
     def work(frame: Frame) -> Step[Any]:
-        given, where = _given(method, frame), tools.assembly.where
-        where.enter(frame.index)
-        with error_context(SLOT, method, where):
+        given = _given(method, frame)
+        tools.assembly.where.enter(frame.index)
+        with tools.assembly.blame(SLOT):
             step = method.begin(given, tools) if state is None else method.step(state, given, tools)
         _check_step(method, None if state is None else state.player, step, frame=frame, tools=tools)
         return step
@@ -78,7 +77,7 @@ def run_follow_up(
     """
 
     def work(frame: Frame) -> Step[Any]:
-        with error_context(SLOT, method, tools.assembly.where), tools.log.phase("other"):
+        with tools.assembly.blame(SLOT), tools.log.phase("other"):
             found = method.follow_up(state, step, _given(method, frame), tools)
         if found is not step:
             _check_follow_up(method, step, found, tools)
@@ -94,7 +93,7 @@ def run_follow_up(
 def run_resume(method: StreamingMethod[Any], player: PlayerState, shown: Frame, tools: RunTools) -> Any:
     """Return the state of the method after the last packet of a stream."""
     tools.assembly.where.enter(player.frame)
-    with error_context(SLOT, method, tools.assembly.where):
+    with tools.assembly.blame(SLOT):
         return method.resume(player, _given(method, shown), tools)
 
 

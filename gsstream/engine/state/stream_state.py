@@ -17,6 +17,7 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.engine.fit.densify import DensifyStatistics
 from gsstream.engine.fit.frame_images import FrameImages
+from gsstream.input.seeds.shell import Shell
 from gsstream.method.base import Step as MethodStep
 from gsstream.packet import PlayerState
 from gsstream.parts.motion.base import MotionPart
@@ -71,6 +72,7 @@ class StreamState:
     decoders: Mapping[str, torch.Tensor] = field(default_factory=dict)
     exposure: Exposure | None = None  # colour maps of the training cameras, or None
     key_frame: int = 0  # frame of the last key packet
+    shell: Shell | None = None  # the sphere behind the scene; None: the recipe asks for none
     #: The first frame as it goes on being optimised beside the stream; None before the frame after it, from the key
     #: packet on that brings it, and when the recipe asks for none.
     refinement: Refinement | None = None
@@ -103,14 +105,12 @@ def next_state(motion: MotionPart, state: StreamState, player: PlayerState, rng:
     A resumed run calls this for every packet it replays, so it depends on nothing but the packet.
     """
     decoders = {**state.decoders, **{name: torch.from_numpy(value) for name, value in player.decoders.items()}}
-    after = replace(state, player=player, decoders=decoders)
-    if player.delta is None or player.before is None:
+    after, delta, before = replace(state, player=player, decoders=decoders), player.delta, player.before
+    if delta is None or before is None:
         return after
-    memory = motion.follow(state.motion_memory, player.frame, player.before, player.delta, rng)
-    after = replace(after, motion_memory=memory)
-    if not player.delta.has_row_edit:
-        return after
-    return replace(after, hierarchy=next_hierarchy(state.hierarchy, player.delta.added, player.layout))
+    if delta.has_row_edit:
+        after = replace(after, hierarchy=next_hierarchy(state.hierarchy, delta.added, player.layout))
+    return replace(after, motion_memory=motion.follow(state.motion_memory, player.frame, before, delta, rng))
 
 
 def next_hierarchy(hierarchy: Hierarchy, added: AddedGaussians | None, layout: Layout) -> Hierarchy:

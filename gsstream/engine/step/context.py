@@ -48,16 +48,18 @@ class EngineContext:
         part_scale: float = 1.0,
         images: FrameImages | None = None,
     ) -> None:
-        self._assembly, device, resident = assembly, assembly.renderer.device, state.resident
+        self._assembly, device = assembly, assembly.renderer.device
+        resident = state.resident
         if resident is None:
             gaussians = state.gaussians.map(lambda value: value.to(device))
             resident = Resident(gaussians, state.hierarchy.to(device), state.shown(device))
         self._gaussians, self._hierarchy, self.previous_images = resident
-        self._frame, self._previous, self._device = frame, state.previous, device
-        self._change = change
+        self._device, self._frame, self._change = device, frame, change
+        self._previous, self._shell = state.previous, state.shell
         self._static = [] if change is None else [count == 0 for count in change.per_view]
         self._background, self._part_scale = assembly.background, part_scale
-        self.log, self.key_rows = log, state.player.key_rows
+        self.log = log
+        self.key_rows = state.player.key_rows
         exposure = None if state.exposure is None else state.exposure.to(device)
         self.images = FrameImages(frame.images, device) if images is None else images
         self.photometric = PhotometricLoss(assembly.renderer.loss, DSSIM, self.images, exposure)
@@ -151,10 +153,10 @@ class EngineContext:
 
     @property
     def shell_rows(self) -> torch.Tensor:
-        if not self._assembly.recipe.first_frame.shell:
+        if self._shell is None:
             return torch.zeros_like(self._gaussians.opacities, dtype=torch.bool)
         means, scales = self._gaussians.means.cpu().numpy(), self._gaussians.scales.cpu().numpy()
-        return torch.from_numpy(in_shell(means, scales, self.cameras)).to(self._device)
+        return torch.from_numpy(in_shell(means, scales, self._shell)).to(self._device)
 
     def changed_rows(self, min_votes: float) -> torch.Tensor:
         if self._change is None:

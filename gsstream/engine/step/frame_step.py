@@ -19,7 +19,6 @@ from gsstream.core.rng import Rng
 from gsstream.core.storage import packed
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import Checks
-from gsstream.engine.assembly.guard import error_context
 from gsstream.engine.budget.epoch_scheduler import EpochScheduler
 from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.engine.state.stream_state import Resident, Step, StreamState, next_state, updated
@@ -90,7 +89,7 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
         after = next_state(assembly.motion, kept, player, rng)
     log.set(changed_tiles=1.0 if change is None else change.share, **step_numbers(solution, len(rows), session))
     if (schedule.timed or schedule.sized) and (len(rows) or scope is Scope.NONE):
-        log.set(budget=schedule.usage(fitted, state.player.layout))
+        log.set(budget=schedule.usage(fitted))
     return Step(after, replace(fitted.packet, decoded=player), "empty" if unchanged else "delta")
 
 
@@ -120,7 +119,7 @@ def with_growth(assembly: Assembly, state: StreamState, delta: Delta, work: Engi
         return delta  # the scene after the residual is not needed
     after = apply_delta(state.player.scene, delta)
     rows = assembly.growth.propose(after, work, rng)
-    with error_context("growth", assembly.part("growth"), assembly.where):
+    with assembly.blame("growth"):
         if rows is not None:
             apply_delta(after, Delta((rows,)))  # before rows are left out: a wrong proposal gets an error
             rows = replace(rows, removed=rows.removed[~work.shell_rows.cpu().numpy()[rows.removed]])

@@ -46,15 +46,7 @@ def propose_motion(
     Raises ComponentError when the part fails, or proposes motions that do not fit the scene or cannot be sent.
     """
     scene, budget = state.player.scene, tools.budget
-    work = EngineContext(
-        assembly=assembly,
-        state=state,
-        frame=frame,
-        log=tools.log,
-        change=change,
-        part_scale=budget.part_scale,
-        images=images,
-    )
+    work = EngineContext(assembly, state, frame, tools.log, change=change, part_scale=budget.part_scale, images=images)
     proposed = assembly.motion.propose(scene, work, tools.rng, state.motion_memory)
     motions = tuple(motion for motion in proposed if not motion.is_empty)
     if not motions:

@@ -92,7 +92,7 @@ def encode_frame(
     motions = delta.motions
     encoded = partial(delta_packet, before, frame=frame, known=(motions, encode_motions(motions)))
     packet = encoded(delta)
-    whole = TrimmedDelta(delta, packet, delta, len(packet.data))
+    whole = TrimmedDelta(delta, packet, delta, len(packet.data), before.layout)
     limit = max_bytes or _share(delta, encoded, whole.untrimmed, trim)
     if whole.untrimmed <= limit:
         return whole

@@ -13,7 +13,7 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.log import FrameLog
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.frame0.begin import begin, exposure_from_meta
+from gsstream.engine.frame0.begin import begin, exposure_from_meta, shell_behind
 from gsstream.engine.frame0.optimise import Progress
 from gsstream.engine.frame0.reuse import reuse_first_frame
 from gsstream.engine.state.stream_state import StreamState
@@ -69,5 +69,6 @@ class RunTools:
     def open(self, player: PlayerState, previous: Frame, frame: Frame) -> EngineContext:
         roots = torch.arange(len(player.layout.node_counts))
         forest = Hierarchy(torch.from_numpy(player.layout.node_of), roots, torch.zeros_like(roots))
-        state = StreamState(player, forest, previous, exposure=exposure_from_meta(player.meta))
+        exposure, shell = exposure_from_meta(player.meta), shell_behind(self.assembly, player)
+        state = StreamState(player, forest, previous, exposure=exposure, shell=shell)
         return EngineContext(self.assembly, state, frame, self.log)

@@ -74,13 +74,12 @@ def shell_points(images: FloatArray, cameras: Cameras) -> PointCloud:
     return PointCloud(xyz, _colors(xyz.astype(np.float64), images, cameras), "a sphere behind the scene")
 
 
-def in_shell(means: FloatArray, scales: FloatArray, cameras: Cameras) -> BoolArray:
+def in_shell(means: FloatArray, scales: FloatArray, shell: Shell) -> BoolArray:
     """Return [N] bool: which Gaussians are what became of the sphere's seeds.
 
     Arguments:
-        means: [N, 3] centres. scales: [N, 3] log standard deviations. cameras: the training cameras.
+        means: [N, 3] centres. scales: [N, 3] log standard deviations. shell: of the training cameras.
     """
-    shell = find_shell(cameras)
     far = ((means - shell.center) ** 2).sum(1) >= (BEYOND * shell.radius) ** 2
     found: BoolArray = far & (scales.max(1) >= math.log(WIDE * shell.sigma))
     return found

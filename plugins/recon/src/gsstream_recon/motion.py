@@ -127,7 +127,8 @@ class AnchorMotion(MotionPart):
         return () if motion is None else (motion,)
 
     def follow(self, memory: Any, frame: int, before: Layout, delta: Delta, rng: Rng) -> AnchorLevels:
-        return followed(self._anchors(memory, frame, len(before.unit_of), rng), before, delta)
+        anchors = self._anchors(memory, frame, len(before.unit_of), rng)
+        return followed(anchors, before, delta)
 
     def _anchors(self, memory: AnchorLevels | None, frame: int, number: int, rng: Rng) -> AnchorLevels:
         """Those of the frame before, or new ones when these are old or a level has none.

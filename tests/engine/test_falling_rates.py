@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 from flow_runs import WORLD, encode
-from gsstream_cpu_render.adam_part import CpuAdam
+from gsstream_cpu_render.renderer import CpuAdam
 from gsstream_cpu_render.residual import CpuResidualOptimiser
 
 from gsstream.engine.step.optimise import lr_factor

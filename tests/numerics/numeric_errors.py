@@ -109,8 +109,7 @@ def render_measures() -> dict[str, Measure]:
         "loss gradient (reference)": lambda seed: loss(ReferenceLoss(), 1, seed),
     }
     try:
-        from gsstream_cpu_render.loss_part import CpuLoss
-        from gsstream_cpu_render.renderer import CpuRenderer
+        from gsstream_cpu_render.renderer import CpuLoss, CpuRenderer
     except ImportError:
         return measures
     native, native_loss = CpuRenderer(), CpuLoss()

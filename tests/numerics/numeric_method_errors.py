@@ -258,7 +258,7 @@ def method_measures() -> Mapping[str, Measure]:
         "optimiser (reference)": lambda seed: adam(ReferenceAdam(), seed),
     }
     try:
-        from gsstream_cpu_render.adam_part import CpuAdam
+        from gsstream_cpu_render.renderer import CpuAdam
     except ImportError:
         return measures
     return measures | {"optimiser (cpu)": lambda seed: adam(CpuAdam(), seed)}

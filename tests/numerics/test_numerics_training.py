@@ -210,7 +210,7 @@ def test_a_spike_of_the_learning_rate_is_refused_or_survived_never_sent_as_garba
 
 def optimisers() -> list[RowOptimiser]:
     try:
-        from gsstream_cpu_render.adam_part import CpuAdam
+        from gsstream_cpu_render.renderer import CpuAdam
     except ImportError:
         return [ReferenceAdam()]
     return [ReferenceAdam(), CpuAdam()]

@@ -13,10 +13,8 @@ import numpy as np
 import pytest
 import torch
 from cpu_scenes import relative_error
-from gsstream_cpu_render.adam_part import CpuAdam
 from gsstream_cpu_render.loss import photometric_loss
-from gsstream_cpu_render.loss_part import CpuLoss
-from gsstream_cpu_render.renderer import CpuRenderer
+from gsstream_cpu_render.renderer import CpuAdam, CpuLoss, CpuRenderer
 from numpy.typing import NDArray
 from test_cpu_renderer import rig, scene
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 from cpu_scenes import BACKGROUND, random_splats
-from gsstream_cpu_render.loss_part import CpuLoss
-from gsstream_cpu_render.renderer import CpuRenderer
+from gsstream_cpu_render.renderer import CpuLoss, CpuRenderer
 from gsstream_cpu_render.session import CpuSession
 from test_cpu_renderer import rig
 

@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 import torch
 from cpu_scenes import BACKGROUND, random_splats, rasterizer, upstream
-from gsstream_cpu_render.adam_part import CpuAdam
 from gsstream_cpu_render.adam_step import step_table
 from gsstream_cpu_render.loss import PreparedImage, photometric_loss, tile_shape
-from gsstream_cpu_render.renderer import CpuRenderer
+from gsstream_cpu_render.renderer import CpuAdam, CpuRenderer
 from gsstream_cpu_render.threads import set_num_threads
 from test_cpu_fit import VIEW, comparison, values
 from test_cpu_pass import CASES, captured, solved

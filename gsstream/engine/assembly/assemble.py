@@ -11,7 +11,7 @@ from typing import Any
 
 from gsstream.core.errors import InputError, UnknownName
 from gsstream.core.kinds import PART_KINDS
-from gsstream.core.part import Part, unwrapped
+from gsstream.core.part import Part
 from gsstream.discovery.catalog import Catalog
 from gsstream.engine.assembly.checks import Checks, requested_checks
 from gsstream.engine.assembly.choose_renderer import Chosen, choose_renderer, construct
@@ -62,7 +62,7 @@ class Assembly(LiveParts):
 
     def part(self, slot: str) -> Part:
         """Return the part of a slot itself, without its guard."""
-        part: Part = unwrapped(getattr(self, slot))
+        part: Part = getattr(self, slot).__wrapped__
         return part
 
     def blame(self, slot: str) -> AbstractContextManager[None]:

@@ -22,22 +22,21 @@ from gsstream.recipe.model import Stream
 
 
 class Controller:
-    """Plans frames of one run and writes down what became of the plans; does nothing where the budget is empty."""
+    """Plans frames of one run and writes down what became of the plans; a run without a budget has none."""
 
     def __init__(self, budget: Budget, stream: Stream) -> None:
         self.budget, self._stream, self._unlimited = budget, stream, unlimited(stream)
-        self._limits_frames, self._limits_anything = budget.limits_frames, budget.limits_anything
         self._history: tuple[Past, ...] = ()
         self._key: tuple[float, float] | None = None
 
     def remember(self, lines: Iterable[Mapping[str, Any]]) -> None:
-        """Go on after these lines of ``metrics.jsonl``; without a budget there is nothing to remember."""
-        for line in lines if self._limits_anything else ():
+        """Go on after these lines of ``metrics.jsonl``."""
+        for line in lines:
             self._note(line)
 
     def allow(self, log: FrameLog, first: bool = False) -> FrameBudget:
         """Return what the frame of this log may spend; a stream's first, from which all starts, has no limit."""
-        if first or not self._limits_frames:
+        if first or not self.budget.limits_frames:
             return self._unlimited
         clock = time.perf_counter
         return replace(plan(self.budget, self._stream, self._history), started=clock() - log.elapsed(), clock=clock)
@@ -63,8 +62,6 @@ class Controller:
             log: its log. A method that has made iterations, or has logged its own use as ``budget``, is described by
                 that, or else by its phases and the size of its packet.
         """
-        if not self._limits_anything:
-            return
         numbers, seconds, entry = log.numbers, log.elapsed(), dict[str, Any]()
         actual = {"time": seconds, "size": len(step.packet.data), "memory": 1e6 * peak_memory_mb()}
         known = actual if allowed.is_limited else ("memory",)

@@ -36,12 +36,11 @@ SHOWN = "shown"
 
 
 def refine_first_frame(assembly: Assembly, state: StreamState, step: Step, frame: Frame, tools: Tools) -> Step:
-    """Return a step whose state has the refinement after this frame; as it is where the recipe asks for none.
+    """Return a step whose state has the refinement after this frame.
 
-    ``state`` is that before the frame. A frame that is skipped only moves what is refined.
+    ``state`` is that before the frame, of a stream whose first frame is being refined. A frame that is skipped only
+    moves what is refined.
     """
-    if not is_refining(assembly.recipe.stream, state):
-        return step
     with tools.log.phase("refine"):
         after, before = step.state, state.refinement or start_refinement(state.player)
         found = advance_refinement(
@@ -53,8 +52,6 @@ def refine_first_frame(assembly: Assembly, state: StreamState, step: Step, frame
 
 def runs_after_packet(stream: Stream, state: StreamState, frame: Frame) -> bool:
     """Return whether a frame's iterations of the refinement may follow its packet: the last ones of all may not."""
-    if not is_refining(stream, state):
-        return False
     made = 0 if state.refinement is None else state.refinement.iterations
     return made + (stream.refine_iterations if frame.epoch_scale > 0 else 0) < _iterations(stream)
 

@@ -32,7 +32,6 @@ from gsstream.engine.run.run_frame import live_method, run_follow_up, run_frame,
 from gsstream.engine.step.tools import RunTools
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.input.seeds.shell import mean_color
-from gsstream.method.budget import FrameBudget
 from gsstream.metrics import peak_memory_mb
 from gsstream.packet import EncodedPacket, PlayerState, StreamMeta
 from gsstream.recipe.budget import sized
@@ -99,7 +98,9 @@ class Encoder:
         transform_cameras: bool = False,
     ) -> None:
         held = sized(assembly.recipe.budget, info.fps)
-        self.controller = Controller(held, assembly.recipe.stream)
+        #: What keeps frames to the budget; None where the recipe sets none.
+        self.controller = Controller(held, assembly.recipe.stream) if held.limits_anything else None
+        self._unlimited = unlimited(assembly.recipe.stream)
         self.assembly = replace(assembly, recipe=assembly.recipe.model_copy(update={"budget": held}))
         self.info, self._transform_cameras = info, transform_cameras
         self.rng = Rng(assembly.recipe.seed)
@@ -139,8 +140,10 @@ class Encoder:
         if self.assembly.background != (background := self._background(frame)):
             self.assembly = replace(self.assembly, background=background)
         frame, log, worked = self.with_near_plane(frame), FrameLog(), time.process_time()
-        budget = self.controller.allow(log, first=self.state is None)
-        tools = self._tools(budget, log=log, key_refusal=partial(self.controller.key_refusal, budget))
+        tools = self._tools(log=log)
+        if self.controller is not None:
+            budget = self.controller.allow(log, first=self.state is None)
+            tools = replace(tools, budget=budget, key_refusal=partial(self.controller.key_refusal, budget))
         with one_torch_thread():
             step = run_frame(self.method, self.state, frame, tools)
         step = replace(step, packet=replace(step.packet, decoded=None))  # a queue of packets must not hold scenes
@@ -148,7 +151,8 @@ class Encoder:
         if self.state is not None:  # only now, so that the packet is not delayed by it
             with one_torch_thread():
                 step = run_follow_up(self.method, self.state, step, frame=frame, tools=tools)
-        self.controller.settle(step, budget, len(frame.cameras), log)
+        if self.controller is not None:
+            self.controller.settle(step, tools.budget, len(frame.cameras), log)
         log.set(cpu_seconds=time.process_time() - worked, peak_memory_mb=peak_memory_mb())
         self.state = step.state
         line = {"frame": frame.index, "status": step.status, **log.entry()}
@@ -190,13 +194,13 @@ class Encoder:
             cameras = snap_cameras(self.info.world.inverse_cameras(cameras))
         return replace(frame, cameras=replace(cameras, near_plane=self.near_plane))
 
-    def _tools(self, budget: FrameBudget | None = None, **changes: Any) -> RunTools:
+    def _tools(self, **changes: Any) -> RunTools:
         return RunTools(
             self.assembly,
             self.rng,
             self._meta,
             self._points,
-            budget=budget or unlimited(self.assembly.recipe.stream),
+            budget=self._unlimited,
             first=self._first,
             progress=self._listeners.progress,
             **changes,

@@ -9,7 +9,7 @@ from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import begin
-from gsstream.engine.frame0.refine import refine_first_frame, runs_after_packet
+from gsstream.engine.frame0.refine import is_refining, refine_first_frame, runs_after_packet
 from gsstream.engine.frame0.reuse import reuse_first_frame
 from gsstream.engine.keys.keyframes import key_packet_if_due
 from gsstream.engine.keys.resume import refinement_after, state_after
@@ -49,16 +49,18 @@ class PartsMethod(StreamingMethod[StreamState]):
         return make(self.slots, frame, tools)
 
     def step(self, state: StreamState, frame: Frame, tools: Tools) -> Step:
-        step = frame_step(self.slots, state, frame, tools)
-        if runs_after_packet(self.slots.recipe.stream, state, frame):
-            return step  # no key packet is due before the last iteration of the refinement
-        refined = refine_first_frame(self.slots, state, step, frame=frame, tools=tools)
-        return key_packet_if_due(self.slots, refined, frame, tools)
+        step, stream = frame_step(self.slots, state, frame, tools), self.slots.recipe.stream
+        if is_refining(stream, state):
+            if runs_after_packet(stream, state, frame):
+                return step  # no key packet is due before the last iteration of the refinement
+            step = refine_first_frame(self.slots, state, step, frame=frame, tools=tools)
+        return key_packet_if_due(self.slots, step, frame, tools)
 
     def follow_up(self, state: StreamState, step: Step, frame: Frame, tools: Tools) -> Step:
-        if not runs_after_packet(self.slots.recipe.stream, state, frame):
-            return step
-        return refine_first_frame(self.slots, state, step, frame=frame, tools=tools)
+        stream = self.slots.recipe.stream
+        if is_refining(stream, state) and runs_after_packet(stream, state, frame):
+            return refine_first_frame(self.slots, state, step, frame=frame, tools=tools)
+        return step
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> StreamState:
         state = replace(state_after(self.slots, tools.since_key(), tools.rng), previous=shown)

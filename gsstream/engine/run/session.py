@@ -177,7 +177,7 @@ class _Run:
     def _resume(self) -> int | None:
         """Resume the stream in the folder; return its last frame, or None when the stream begins anew."""
         stream, log = self.out / STREAM, self.out / METRICS
-        planned = self.encoder.controller.budget.limits_frames
+        planned = self.encoder.assembly.recipe.budget.limits_frames
         # A kill between a packet and its line leaves a frame that no table would count, and that a budget would plan
         # without. A later frame is encoded again, to the same bytes: it costs little, and its line tells everything.
         # Frame 0 may cost as much as all later ones, and a log that is gone the whole run: they are measured again.
@@ -188,7 +188,8 @@ class _Run:
         if wanted is not None:
             _warn_lost_lines(stream, -1 if last is None else last)
         kept = trim_metrics(log, -1 if last is None else last)
-        self.encoder.controller.remember(kept)
+        if self.encoder.controller is not None:
+            self.encoder.controller.remember(kept)
         if last is None and wanted is not None:
             stream.unlink()  # it may hold sound packets of frames that are made again
         if last is not None and wanted is None:

@@ -93,6 +93,8 @@ def encode_frame(
     encoded = partial(delta_packet, before, frame=frame, known=(motions, encode_motions(motions)))
     packet = encoded(delta)
     whole = TrimmedDelta(delta, packet, delta, len(packet.data), before.layout)
+    if max_bytes is None and trim == 0:
+        return whole
     limit = max_bytes or _share(delta, encoded, whole.untrimmed, trim)
     if whole.untrimmed <= limit:
         return whole

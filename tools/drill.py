@@ -53,7 +53,7 @@ class Capture(threading.Thread):
         self._finished, self._folder, self._fps, self._frames = finished, folder, fps, frames
         calibration = read_calibration(finished)
         self._patterns, self._length = calibration.patterns, calibration.num_frames
-        #: Most seconds that a frame was complete after its time, and what ended the capture early.
+        #: Largest delay of a frame after its due time, seconds; and what ended the capture early.
         self.late, self.failure = 0.0, ""
         self.stopped = threading.Event()
         folder.mkdir(parents=True)

@@ -33,7 +33,7 @@ from gsstream.engine.run.session import METRICS, STREAM
 from gsstream.evaluation.records import read_lines, read_records
 from gsstream.evaluation.summary import summarise
 
-#: What a clock says, and what memory the process happened to have.
+#: Numbers that depend on the clock, or on the memory that the process happened to use.
 TIMES = ("seconds", "cpu_seconds", "wait_seconds", "peak_memory_mb", "cache", "budget", "live")
 SOURCE = "synthetic:frames=3&views=3&width=32&height=24&supersample=1"
 SETTINGS: Mapping[str, object] = {

@@ -20,7 +20,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PLUGIN = ROOT / "plugins" / "cpu_render"
 FLAGS = "-fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer -g1"
-#: What is run of the plugin's tests: its contract, and what is hardest on memory.
+#: Tests of the plugin that are run: its contract, and those that use memory most.
 CONTRACT = ("test_cpu_contract.py", "test_cpu_raster_faults.py", "test_cpu_states.py", "test_native_threads.py")
 #: Puts the library of this build in the place of the one that is installed.
 _STAND_IN = """

@@ -50,16 +50,17 @@ def docstrings(path: str, code: str) -> Iterator[Sentence]:
 
 
 def comments(path: str, code: str) -> Iterator[Sentence]:
-    """Sentences of comments; comments on consecutive lines are one text."""
+    """Sentences of comments; those on consecutive lines are one text, but for comments behind code."""
     begun, lines, last = 0, list[str](), -1
     tokens = [token for token in tokenize.generate_tokens(io.StringIO(code).readline) if token.type == tokenize.COMMENT]
     for token in tokens:
-        if token.start[0] != last + 1 and lines:
+        behind = bool(token.line[: token.start[1]].strip())
+        if lines and (behind or token.start[0] != last + 1):
             yield from (Sentence(path, begun, text) for text in sentences_of("\n".join(lines)))
             lines = []
         begun = begun if lines else token.start[0]
         lines.append(token.string.lstrip("#: "))
-        last = token.start[0]
+        last = -1 if behind else token.start[0]
     yield from (Sentence(path, begun, text) for text in sentences_of("\n".join(lines)))
 
 

@@ -14,7 +14,7 @@ from gsstream.cli.streams import progress_on
 if TYPE_CHECKING:
     from gsstream.packet.conformance import Result
 
-#: Where a checkout has the suite; an installed gsstream has none.
+#: Folder of the suite in a checkout; an installed gsstream has no suite.
 SUITE = Path(__file__).parents[2] / "tests" / "conformance"
 
 

@@ -21,7 +21,7 @@ from gsstream.core.install_hints import missing_for_encoding
 
 #: Exit codes of runs that a service ended: 128 plus the number of the signal.
 _SIGNALS = {129: "SIGHUP", 143: "SIGTERM"}
-#: Messages may have several lines; nothing else in them that a terminal would obey is printed.
+#: Messages may have several lines; other control characters are left out, because a terminal would obey them.
 _LINE = "\n"
 
 

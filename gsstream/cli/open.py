@@ -66,7 +66,7 @@ def _show(file: Path, url: str, *, browser: bool = True) -> None:
     if browser:
         import webbrowser
 
-        # Beside the server: a browser in the terminal comes back only when it is left.
+        # In a thread beside the server: a browser that runs in the terminal returns only when the user leaves it.
         threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
 

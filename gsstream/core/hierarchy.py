@@ -71,7 +71,7 @@ def tree_roots(parent: torch.Tensor) -> torch.Tensor:
     root = parent
     for _ in range(len(parent).bit_length()):
         further = root[root]
-        if bool((further == root).all()):  # whatever is jumped from here, it stays
+        if bool((further == root).all()):  # all nodes have reached their root
             break
         root = further
     # Checked at the end, because a circle whose length is a power of two looks like a root in between.

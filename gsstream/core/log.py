@@ -43,7 +43,7 @@ class FrameLog:
         self._started = time.perf_counter()
         self._phases: dict[str, float] = {}
         self._numbers: dict[str, Any] = {}
-        #: For each phase that is open, what phases inside it have taken.
+        #: For each open phase, the seconds that phases inside it have taken.
         self._inner: list[float] = []
 
     @contextmanager

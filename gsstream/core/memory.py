@@ -18,7 +18,8 @@ from gsstream.core.errors import InputError
 from gsstream.core.quantity import BYTES, read_quantity
 
 VARIABLE = "GSSTREAM_MAX_MEMORY"
-#: Of the machine's memory, where nobody names a limit; and what is taken for it where the system does not tell.
+#: Share of the machine's memory that may be used where nobody names a limit; and the bytes that a machine is taken to
+#: have where the system does not tell.
 SHARE, UNKNOWN = 0.5, 8_000_000_000
 #: What a container may use.
 _CGROUP = Path("/sys/fs/cgroup/memory.max")

@@ -18,8 +18,8 @@ from gsstream.player.render import PlayerRenderer, render
 
 #: Training cameras that must see a surface: one alone does not say where it is.
 MIN_CAMERAS = 2
-#: Largest difference of two depths of one surface, as a share of the depth: 98.3 % of the pixels are as true depth has
-#: them then, of rendered pictures 1352 wide, and 95.2 % with 0.02.
+#: Largest difference of two depths of one surface, as a share of the depth. In rendered pictures 1352 wide, 98.3 % of
+#: the pixels are then judged as the true depth would judge them; with 0.02, 95.2 %.
 TOLERANCE = 0.05
 #: Least share of a pixel's light that must come from Gaussians, else nothing is there that could be seen.
 MIN_ALPHA = 0.5

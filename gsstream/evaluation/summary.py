@@ -112,5 +112,5 @@ def format_table(rows: Sequence[Sequence[str]]) -> str:
 
 def _cell(value: float, form: str) -> str:
     if form == "{:.1f}" and 0 < value < 0.1:
-        form = "{:.3f}"  # a packet of 16 bytes is not one of none
+        form = "{:.3f}"  # a packet has 16 bytes and must not be printed as 0
     return form.format(value) if math.isfinite(value) else "-"

@@ -83,7 +83,7 @@ def _open(path: Path) -> Any:
     if not path.is_file():
         raise InputError(f"no ONNX file at {path}; {page('howto/lpips.md')} says how to make one")
     options = runtime.SessionOptions()
-    options.log_severity_level = 4  # what goes wrong comes as an exception; its log would only repeat it
+    options.log_severity_level = 4  # onnxruntime raises what goes wrong; its log would only repeat that
     try:
         return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's errors have no common base of their own

@@ -19,7 +19,8 @@ OPEN_GAP = np.pi / 2
 MIN_SWING = np.pi / 18
 #: How far beyond a limit a picture fades out: an angle in radians, and a factor of the distance.
 SLACK, SLACK_FACTOR = np.pi / 18, 1.3
-#: Nearer than the nearest camera by this factor pixels of the recording are twice as large; farther tells little more.
+#: Limits of the distance, as factors of that of the nearest and of the farthest camera: at the first, pixels of the
+#: recording are twice as large; beyond the second there is little more to see.
 NEAREST, FARTHEST = 0.5, 1.5
 #: Nearer than this to straight up or down (cosine) an azimuth says nothing.
 STEEP = float(np.cos(np.pi / 18))
@@ -40,7 +41,7 @@ class Region:
     #: Whether cameras look away from the focus; then angles are those of where they look, else those of where they
     #: stand.
     outward: bool
-    #: The middle of its range and half of it, radians (:meth:`angles`); None: all around.
+    #: The middle of the range and half of its width, radians (:meth:`angles`); None: all around.
     azimuth: tuple[float, float] | None
     elevation: tuple[float, float]  # lowest and highest, radians
     distance: tuple[float, float]  # smallest and largest from the focus, scene units

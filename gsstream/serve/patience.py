@@ -12,7 +12,8 @@ from gsstream.serve.app import MAX_ADDRESS
 
 #: Seconds that a connection may take for the header of a request, and how many connections may be without a request.
 HEADER_SECONDS, MOST_SILENT = 10.0, 64
-#: Bytes of a header, and headers, above which the parser of sockets says nothing.
+#: Bytes of a header, and number of headers, that a request for a web socket may have; the parser itself drops a longer
+#: one without an answer.
 MAX_HEADER, MAX_HEADERS = 8000, 100
 #: Seconds between two looks at the clock.
 _LOOK = 0.5

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from gsstream.serve.hub import Hub
 
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
-#: Bytes that the system takes from us before the viewer has taken those before them, and milliseconds after which a
-#: viewer that takes nothing is cut off. Both where the system knows them.
+#: Bytes that the system may hold back for a viewer who has not taken earlier ones, and milliseconds after which a
+#: viewer that takes nothing is cut off. Both are set where the system knows such limits.
 _UNSENT, _TIMEOUT_MS = 128 << 10, 60_000
 #: Largest message of a viewer; it only asks for the time.
 _MAX_MESSAGE_BYTES = 1024

@@ -24,7 +24,7 @@ from gsstream.testing.working import THRESHOLD, FitFixture
 
 #: Index of the frame: another than that of the frame in ``testing.working``.
 INDEX = 8
-#: Pixels of a scene unit at the origin, at which all cameras look.
+#: Number of pixels that a scene unit at the origin takes in a picture; all cameras look at the origin.
 PIXELS = 20.0
 CAMERAS = replace(
     rig(), width=96, height=48, Ks=np.tile(np.array([[3 * PIXELS, 0, 48], [0, 3 * PIXELS, 24], [0, 0, 1]]), (3, 1, 1))

@@ -274,7 +274,7 @@ WORLDS: dict[str, Callable[[], World]] = {
     "huge logits": lambda: _sure("huge logits", 1e4),
 }
 
-#: Worlds at the ends of what there can be; every part of a kind with ``behaviour`` is tried on each.
+#: Extreme worlds; every part of a kind with ``behaviour`` is tried on each.
 EXTREMES = (
     "empty", "one", "two identical", "coincident", "line", "far", "tiny", "vast", "thin", "unseen", "one camera",
     "logits of 20", "logits of 100", "huge logits",

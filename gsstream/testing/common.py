@@ -222,7 +222,7 @@ def check_rejects_nonfinite(part: Part) -> None:
                 continue
             repaired = [name for name in read if bool(torch.isfinite(got[name]).all())]
             assert not repaired, f"{poison.what} was {bad}, and it was repaired silently; expected an InputError"
-            # Seams called once per iteration may hand it on: it shows in the loss.
+            # Functions that are called in every iteration may hand such a value on: it shows in the loss.
             allowed = behaviour_of(part).hands_on or not read
             assert allowed, f"{poison.what} was {bad}, and it was passed on; expected an InputError"
 

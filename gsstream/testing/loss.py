@@ -10,7 +10,7 @@ from gsstream.testing.cases import fingerprint
 from gsstream.testing.compare import at_most, equal, finite, relative
 from gsstream.testing.registry import check
 
-#: Three tiles by three, the last ones cut.
+#: Pictures have three tiles by three, of which the border cuts the last.
 HEIGHT, WIDTH = 40, 44
 WHY = "sums of float32 in another order; relative to the largest"
 

@@ -24,10 +24,11 @@ from gsstream.testing.compare import EXACT, at_most, equal, gradients_equal, rel
 from gsstream.testing.registry import check
 
 #: Of the largest value of a gradient. A renderer may blend what stands still once for all passes of a frame, and then
-#: a pixel whose light is nearly used up may end a Gaussian later (docs/results/cost.md).
+#: compositing may stop one Gaussian later in a pixel near the transmittance cut-off (docs/results/cost.md).
 NEAR = 5e-3
 WHY = "the same calls, up to rounding and the end of a pixel's light"
-#: The least that gradients and curvatures of transforms are measured by: a thousandth of what they are here.
+#: Least value that errors of gradients and curvatures of transforms are divided by: a thousandth of their size in this
+#: scene.
 MIN_GRADIENT = 1e-5
 #: What renders are compared with.
 IMAGE = torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(4))
@@ -142,7 +143,7 @@ def check_renderer_loss_and_grad_kept(part: Renderer) -> None:
 def check_renderer_grad(part: Renderer) -> None:
     """Gradients repeat bit for bit, leave rows and graphs alone, add up over tiles, and are 0 where nothing counts."""
     loss = part.loss
-    target = ViewTarget(loss, loss.prepare(IMAGE), 0.0, IMAGE)  # without SSIM, every pixel speaks for itself
+    target = ViewTarget(loss, loss.prepare(IMAGE), 0.0, IMAGE)  # without SSIM: a sum over pixels
     session, rows = narrowed(part)
     leaves = rows.map(lambda value: value.clone().requires_grad_())
     before = fingerprint(leaves.map(torch.Tensor.detach))

@@ -16,7 +16,8 @@ from gsstream.testing.working import check_closed_loop, fit_fixture
 #: Share of a body's motion that a part may leave to the residual after the passes that it makes by default: published
 #: step sizes are for wider pictures, and no part is tuned to these. A part that looks at no gradient leaves all of it.
 MOST_LEFT = 0.75
-#: Pixels by which a motion may miss a share of the last one: half a step of 0.1, and what anchors lose to each other.
+#: Pixels by which a motion may differ from the share of the last frame's motion that it begins with: half a
+#: quantisation step of 0.1, and the error of motions that anchors average.
 TOLERANCE = 0.25
 
 

@@ -11,7 +11,8 @@ from gsstream.core.part import Part
 from gsstream.testing.recording import Skip as Skip
 from gsstream.testing.recording import SourceUnderTest
 
-#: The kinds that all common checks are made on; of the others only settings, freezing and declaration.
+#: Kinds of part on which all common checks are made; on parts of other kinds only those of settings, freezing and
+#: declaration are.
 BEHAVED = tuple(name for name, kind in PART_KINDS.items() if kind.behaviour)
 
 #: Characters of a reason why a check fails, at least: enough for a sentence, too many for "todo".

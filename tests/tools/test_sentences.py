@@ -16,7 +16,9 @@ def one() -> int:
     """
     # A comment that goes on over two lines is one
     # sentence all the same.
-    return 1
+    one = 1  # a comment behind code is a text of its own
+    two = 2  # short
+    return one
 '''
 PAGE = """# A heading of more than six words is none
 
@@ -38,7 +40,8 @@ def test_what_counts_as_a_sentence() -> None:
         "never two, and here is a list that says so:",
         "- the first item of this list is a sentence",
     ]
-    (comment,) = comments("a.py", CODE)
+    comment, behind = comments("a.py", CODE)
+    assert behind.text == "a comment behind code is a text of its own"
     assert comment.text == "A comment that goes on over two lines is one sentence all the same."
     assert comment.line == 11
     (page,) = pages("a.md", PAGE)

@@ -72,7 +72,7 @@ def _layouts() -> Iterator[Vector]:
     sections = key_sections(scene(36, 0), layout(36, 0, 0, ()))
     many = struct.pack("<IIB", 65536, 65536, 1) + struct.pack("<f", 1) + parts(constant(1, 65536), constant(0, 65536))
     sections |= {"layout": many, **flat(65536)}
-    # 65,536 rows are free; each row more takes a 64th of a byte.
+    # 65,536 rows are free; each further row needs a 64th of a byte.
     yield playing("layout-most-rows-of-a-small-packet", "layout limits", "3.5-1 1.8-1", Tape().key(sections))
 
 

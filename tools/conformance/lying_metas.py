@@ -137,7 +137,7 @@ def _lens(*changes: tuple[int, float]) -> list[float]:
     return K
 
 
-#: What is wrong, the rule, and the entries of train.
+#: Name of the fault, the rule that it breaks, and entries of ``train`` that have it.
 RIGS: list[tuple[str, str, dict[str, Any]]] = [
     ("ids-a-text", "3.3-1", {"ids": "c"}),
     ("ids-of-numbers", "3.3-1", {"ids": [1]}),

@@ -17,7 +17,7 @@ from gsstream.packet.symbols import encode_symbols
 from tools.conformance.coding import Model, bits, column, constant, parts, run_gates, table
 from tools.conformance.tapes import Tape, Vector, key_sections, layout, playing, scene
 
-#: Counts of 32 bits down to 1.
+#: Counts that fall from 32 bits to 1, by half each time.
 FALLING = [5 << n >> 2 for n in range(31, 1, -1)]
 Listed = list[tuple[str | int, bytes]]
 

@@ -44,7 +44,7 @@ def checks() -> str:
     return "\n".join([*lines, ""])
 
 
-#: What a reader may miss among the checks.
+#: Promise for which a reader may look for a check -> why there is none.
 ELSEWHERE = {
     "a structure's time grows with N, not faster": "no check decides by a clock, and shared machines have poor ones",
     "memory returns after an estimate": "`check_confidence_no_grad_left` refuses what would hold it, a graph",

@@ -23,8 +23,8 @@ from gsstream.parts.render.session import RenderSession
 from gsstream.parts.residual.optimiser import ResidualOptimiser
 
 T = TypeVar("T")
-#: The names under which the table below and that of the checks list what parts open: sessions and changes of a
-#: renderer, residuals of an optimiser. Errors about them name the part.
+#: Names of what parts open (sessions and changes of a renderer, residuals of an optimiser) in the table below and in
+#: the table of checks. Errors about them name the part.
 SESSION, RESIDUAL = "session", "residual"
 OPENED: Mapping[str, type] = {SESSION: RenderSession, RESIDUAL: ResidualOptimiser, "change": Change}
 #: What a renderer brings: attributes that stand behind a guard of their own, so that an error names them.
@@ -132,7 +132,7 @@ class Guarded:
             with error_context(slot, part, where):
                 result = method(*args, **kwargs)
                 if name == "propose":
-                    where.pause()  # what the part fitted is over: what is wrong with the result is of no iteration
+                    where.pause()  # the part's own iterations are over: an error about its result names none
                 if look is not None:
                     look(looking, args, result)
             return Guarded.opened(result, slot, part, where, level)

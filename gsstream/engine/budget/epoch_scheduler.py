@@ -130,7 +130,8 @@ class EpochScheduler:
         """
         seconds, after = self._seconds, self.budget.after
         kept = min(self._each, UNKNOWN_RESERVE * seconds) if after is None else after
-        # A run that is behind hurries to catch up: what the passes of a hurried frame leave of its time is not theirs.
+        # A run that is behind gives its frames less time, to catch up: the time that such a frame saves must not be
+        # spent on more passes.
         given_up = (1 - self._epoch_scale) * (seconds - kept - self.before)
         return self.budget.started + seconds - kept - self._read - max(0.0, given_up)
 

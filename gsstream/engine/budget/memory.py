@@ -15,12 +15,14 @@ from gsstream.input.recordings.base import Source
 
 #: Interpreter, torch, the renderer and the engine with everything a run imports (measured).
 PROCESS = 310_000_000
-#: Of a training image: the frame, the one before and two read ahead, which wait as the source hands them over.
+#: Images of each training camera that wait in memory, as the source hands them over: of the frame, of the one before,
+#: and of two that are read ahead.
 WAITING = 4
-#: What is made of images of one camera at a time, in images of float32: renders, gradients, maps of the loss, and the
-#: temporary ones of every phase (measured at widths of 320 and 1352).
+#: Images of float32 that are made for one camera at a time: renders, gradients, maps of the loss, and the temporary
+#: images of every phase (measured at widths of 320 and 1352).
 WORKING = 8
-#: A Gaussian with its gradients and moments in frame 0; and the copies of a frame step, when there are caches.
+#: Bytes of a Gaussian with its gradients and moments in frame 0; and of the copies that a later frame makes of it, when
+#: there are caches.
 BYTES_PER_GAUSSIAN, BYTES_PER_GAUSSIAN_LATER = 1_700, 700
 #: Share of the memory beside the images that Gaussians get; caches get the rest (250 bytes per camera and Gaussian).
 FOR_GAUSSIANS = 0.6

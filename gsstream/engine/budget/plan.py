@@ -21,8 +21,8 @@ from gsstream.recipe.model import Stream
 WINDOW = 5
 #: Share of a time budget that is planned; the rest is a reserve for delays that cannot be predicted.
 TIME_MARGIN = 0.93
-#: Below this share of a size budget the weight falls; above this multiple it rises. In between the packet is trimmed:
-#: that takes 43 % of the bytes for less than any weight does.
+#: Below this share of a size budget the weight falls; above this multiple it rises. In between, the packet is trimmed:
+#: trimming saves 43 % of the bytes and costs less quality than a larger weight does.
 SIZE_TARGET, MAX_TRIMMED = 0.94, 2.0
 #: Largest share of the time that is kept for the phases after the passes, while no frame has shown what they cost.
 UNKNOWN_RESERVE = 0.2
@@ -38,7 +38,8 @@ MIN_EPOCHS = 4
 MIN_WEIGHT, MAX_WEIGHT = 3e-5, 3e-2
 #: Steps get at most this much coarser.
 MAX_STEP_SCALE = 4.0
-#: Thresholds of change rise at most to this many times the recipe's, from this one where the recipe has none.
+#: Largest factor on the recipe's threshold of change; and the threshold that the factor is applied to where the recipe
+#: has none.
 MAX_THRESHOLD, FIRST_THRESHOLD = 4.0, 3.0
 
 
@@ -53,7 +54,8 @@ class Past:
     before: float
     optimise: float
     after: float
-    #: weight, step_scale, threshold: what it was made with; the weight as in the last half of the passes.
+    #: weight, step_scale, threshold: settings that the frame was made with; the weight is that of the last half of the
+    #: passes.
     weight: float
     step_scale: float
     threshold: float

@@ -122,7 +122,7 @@ class _Table:
         self.place = rows, columns = symbols.nonzero()
         gate = np.repeat(np.arange(len(self.opened)), self.counts)
         zeros = np.where(symbols == 0, [code(np.zeros(1, np.int64))[0] for code in codes], 0.0).sum(1)
-        #: What the zeros behind each open gate cost, and the gate itself: [G].
+        #: [G] bits of each open gate together with the zeros behind it.
         self.fixed = np.bincount(gate, zeros, len(self.opened)) + _GATE_BITS
         self.gate = gate[rows]
         steps = [np.full(residual.symbols[n].shape[1], residual.steps[n]) for n in self.names]

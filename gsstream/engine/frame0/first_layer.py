@@ -23,8 +23,8 @@ def first_layer_mask(
         return None
     generator = rng.stream("first layer", frame.index)
     views = TrainingViews(assembly.renderer, frame, exposure, assembly.background)
-    # One probe of a camera is enough for an order: with four the first layer shows 0.1 dB more, and a large picture
-    # takes a second longer.
+    # One probe for each camera is enough to order the Gaussians: with four the first layer shows 0.1 dB more, and a
+    # large picture takes a second longer.
     errors, _ = removal_errors(views, gaussians, generator, probes=1)
     return largest_error_mask(errors, share)
 

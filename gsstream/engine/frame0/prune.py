@@ -22,9 +22,10 @@ from gsstream.engine.frame0.hutchinson import TrainingViews, hutchinson_samples
 HUTCHINSON_SAMPLES = 4
 #: Opacity logits are clamped to this (opacity 0.999): where an opacity is 1 in float32 the gradient is 0.
 MAX_LOGIT = 7.0
-#: How many times as far off the images may be without all that go; the fit that follows closes such gaps.
+#: Factor by which the error of the images may grow when all pruned Gaussians are left out; the fit that follows closes
+#: such gaps.
 GROWTH = 1.25
-#: How often fewer are asked for, a quarter of the error each time.
+#: Most times that fewer Gaussians are tried instead, each time those of a quarter of the error.
 TRIES = 8
 
 

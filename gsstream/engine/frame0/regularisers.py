@@ -18,9 +18,9 @@ from gsstream.recipe.model import FirstFrame
 FEW = 8
 #: Share of the Gaussians that is left out.
 DROPOUT = 0.2
-#: Weight of the smoothness of depth, and how many cameras divide where it pays: so many and more in a room that they
-#: stand in, whose walls are smooth but placed too badly by fewer; fewer than that where they look from one side, and
-#: more of them tell depth better than smoothness does.
+#: Weight of the smoothness of depth, and a number of cameras. In a room that the cameras stand in, smoothness pays with
+#: that many or more: walls are smooth, but fewer cameras place them too badly. Where all look from one side it pays
+#: with fewer: more cameras tell depth better than smoothness does.
 SMOOTHNESS, SMOOTHNESS_CAMERAS = 1.0, 6
 #: Smoothness counts in every second iteration, after a tenth of all: at the start no depth is worth keeping.
 SMOOTHNESS_EVERY, SMOOTHNESS_FROM = 2, 0.1

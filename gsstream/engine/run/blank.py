@@ -6,7 +6,8 @@ import numpy as np
 
 from gsstream.core.frame import Frame
 
-#: Standard deviation below which a picture shows nothing, of [0, 1]; and every how many pixels it is looked at.
+#: Standard deviation, of values in [0, 1], below which a picture shows nothing; and distance of the pixels that are
+#: looked at.
 STRUCTURE, STEP = 0.01, 8
 
 

@@ -133,7 +133,7 @@ class _Run:
         """Resume the stream in the folder, or write the recipe of a new one; return the first frame to encode."""
         last = self._resume() if resume else None
         if last is None:
-            # Before the first packet: a packet without this file would be one that nobody misses a line of.
+            # Made before the first packet: without this file, nobody could tell that the line of the packet is missing.
             (self.out / METRICS).touch()
             save_resolved(self.out / RECIPE, self.encoder.assembly.resolved)
             if sentence := expectation(self.source.info.train):
@@ -180,7 +180,8 @@ class _Run:
         planned = self.encoder.assembly.recipe.budget.limits_frames
         # A kill between a packet and its line leaves a frame that no table would count, and that a budget would plan
         # without. A later frame is encoded again, to the same bytes: it costs little, and its line tells everything.
-        # Frame 0 may cost as much as all later ones, and a log that is gone the whole run: they are measured again.
+        # Frame 0 may cost as much as all later frames together, and where the whole log is gone the run would be
+        # encoded twice: in both cases packets are kept and measured again.
         wanted: int | None = last_written(log)
         if not planned and wanted == -1:
             wanted = None

@@ -18,7 +18,8 @@ from gsstream.metrics.noise import noise_sigma
 
 #: Number of epipolar planes per pair of cameras, spread over the angles that both cameras see.
 PLANES = 48
-#: Changes count above this many levels and above this many standard deviations of noise; large ones count no more.
+#: Changes count above so much and above so many standard deviations of the noise; above the third number, a larger
+#: change counts no more than a smaller one.
 LEVELS, SIGMAS, LARGE = 8 / 255, 6.0, 0.3
 #: Where more of a picture than this changes at once, light or exposure changed: nothing is known of what moved.
 MOST = 0.5

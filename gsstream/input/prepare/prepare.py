@@ -30,7 +30,7 @@ from gsstream.input.recordings.lens import Lens, Undistortion, undistortion
 from gsstream.input.seeds.mapping import Mapping, reconstruct, triangulate
 from gsstream.input.seeds.thinning import thin_points
 
-#: Fewer points than this are none: a run searches for its own.
+#: Fewer points than this are not written: a run then searches for its own.
 MIN_POINTS = 16
 
 Say = Callable[[str], None]

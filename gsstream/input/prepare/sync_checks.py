@@ -197,7 +197,7 @@ def _swapped(cameras: Cameras, seen: list[Motion], now: FloatArray) -> list[Find
     ``now``: [C, C] likeness of each pair as they are.
     """
     mean = _mean(now)
-    own = np.where(np.isfinite(mean), mean, 0.0)  # not compared with any other: like none
+    own = np.where(np.isfinite(mean), mean, 0.0)  # a camera that was compared with no other is like none of them
     suspects = [int(c) for c in np.argsort(own)[:SUSPECTS] if own[c] < STAND_OUT * np.median(own)]
     found = []
     for a, b in combinations(sorted(suspects), 2):

@@ -101,7 +101,7 @@ class WatchSource(Source):
     def stored_image(self, index: int, camera: str) -> Any:
         """Wait for one instant and read one camera's image as it is stored, or its last one where it is absent."""
         shown = dict(self._plan(index).held).get(camera, index)
-        # The image that was decoded to see that it is whole, while it is at hand; else read again.
+        # The image as it was decoded to see whether it is whole; where it is no longer held, it is read again.
         ready = self._decoded.get((camera, shown))
         return self._read(camera, shown) if ready is None else ready
 

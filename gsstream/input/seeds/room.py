@@ -29,11 +29,13 @@ from gsstream.input.seeds.workers import one_thread_each
 
 #: Degrees between two cameras, seen from what all look at, above which a rig stands in the room that it looks into.
 AROUND = 90.0
-#: Most cameras that a room is found by, and that a pixel's place is compared with: time grows with their pairs.
+#: Most cameras that are used to find a room and to compare a pixel's place: the time grows with their pairs.
 MOST_CAMERAS = 8
-#: Deviation of grey that counts as texture, half width of the windows compared, and places that make a score count.
+#: Standard deviation of grey from which a window counts as texture; half the width of the windows that are compared;
+#: and least number of places from which a score counts.
 NOISE, HALF, ENOUGH = 0.02, 3, 500
-#: The middle of the sphere is drawn to the focus, over this share of the rig's size; cameras may stand so far outside.
+#: Distance over which the middle of the sphere is drawn to the focus, as a share of the rig's size; and least radius of
+#: the sphere, as a share of the distance from its middle to the farthest camera.
 CENTER_SPREAD, INSIDE = 0.05, 0.93
 #: Correlations below which another camera contradicts a place on the wall, and above which it confirms the sweep.
 CONTRADICTED, CONFIRMED = 0.2, 0.6

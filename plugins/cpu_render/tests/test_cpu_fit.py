@@ -66,7 +66,7 @@ def some_tiles(seed: int = 6) -> torch.Tensor:
     return torch.rand(shape, generator=g).sub(0.5).clamp(min=0) * 4
 
 
-#: By what a loss is differentiated -> a session, and what it is asked.
+#: Name of what a loss is differentiated by -> a session, and the variables that it is asked for.
 WRT: dict[str, Callable[[], tuple[RenderSession, Any]]] = {
     "rows": lambda: (opened()[0], WrtRows(opened()[1])),
     "transforms": lambda: (opened()[0], WrtTransforms(opened()[1], moves(), curvature=True)),

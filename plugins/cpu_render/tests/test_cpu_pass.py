@@ -34,7 +34,7 @@ TINY = (
     "first_frame.max_points=400",
     "stream.epochs=2",
 )
-#: What takes part in the iterations of each, beside images, residuals, gates, their price and Adam.
+#: Name of a case (what its iterations contain beside images, residuals, gates, their price and Adam) -> its settings.
 CASES = {
     "edge: rates, rows that leave": ("s2gs-edge", ()),
     "levels that wait": ("s2gs-paper", ("gate.noise=none", "stream.epochs=4")),
@@ -64,7 +64,7 @@ def captured(method: str, settings: tuple[str, ...]) -> tuple[Assembly, Problem]
         for index in range(3):
             encoder.encode(source.frame(index))
     problem = found[-1]
-    # The run has committed the session of this frame since.
+    # The run has committed the session of this frame already, so a new one is opened.
     session = parts.renderer.open(
         encoder.state.player.scene.gaussians.map(torch.from_numpy), None, source.frame(2).cameras, parts.background
     )

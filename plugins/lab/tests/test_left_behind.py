@@ -63,7 +63,7 @@ def test_who_goes_along_who_stays_and_who_is_lost_on_the_way(source) -> None:
         now = start.copy()
         now[:went] = inner_ball(source, AT)[:went]
         if name == "lost":
-            now[went:40] = inner_ball(source, AT // 2)[went:]  # where the ball was on its way, and is no more
+            now[went:40] = inner_ball(source, AT // 2)[went:]  # where the ball has been, and is not any more
         found = LeftBehind()
         assert found.after(player(start), source.frame(0), True) == {"body": 0, "outside": 0, "unmoved": 0}
         counted = found.after(player(now), source.frame(AT), False)

@@ -18,7 +18,7 @@ from gsstream.recipe.model import Recipe
 from gsstream.recipe.save import to_yaml
 
 FOLDER = Path(__file__).parents[3] / "configs" / "paper"
-#: Lies on others; alone it is the dense baseline with an active set.
+#: A recipe that is laid on top of others; alone it is the dense baseline with an active set.
 OVERLAY = "candidates.yaml"
 #: Recipes, not tables.
 RECIPES = {"full.yaml", OVERLAY}

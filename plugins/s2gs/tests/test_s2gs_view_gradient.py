@@ -130,7 +130,7 @@ class TestStatistics:
         torch.testing.assert_close(z[:4], part.estimate(told(touched)))
         assert z[4:].tolist() == [pytest.approx(FLOOR)] * 60
         assert float(z[:4].max() - z[:4].min()) > 1
-        # Counted with the others they all saturate: so it was, and so "seen" still is.
+        # Where Gaussians that no change touches are counted, too, as with "seen", the logits of all others saturate.
         alike = estimator(normalisation=normalisation, epsilon_mode="relative", statistics="seen")
         assert alike.estimate(told(gradient))[:4].tolist() == [50.0] * 4
 

@@ -34,7 +34,8 @@ Missing = Literal["skip", "refuse"]
 _SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 #: null counts as not given.
 _OPTIONAL = ("w", "h", "fps", "time", "camera_model", "is_fisheye", "transform_matrix", "ply_file_path", *_SPLITS)
-#: Of nerfstudio, instant-ngp and exporters for Blender; what has no effect there belongs to training or to masks.
+#: Keys that nerfstudio, instant-ngp and exporters for Blender write; those without an effect belong to training or to
+#: masks.
 _KEYS = Keys(
     read=(*INTRINSICS, "fps", "time", "frames", "file_path", "transform_matrix", "ply_file_path", *_SPLITS),
     idle=(
@@ -208,7 +209,7 @@ def _listed(path: Path, data: dict[str, Any], key: str) -> set[str] | None:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise SourceError(f"{path}: {key} must be a list of file names, got {names!r:.60}")
     files = [entry["file_path"] for entry in data["frames"]]
-    # Loosely: in another case, without a suffix.
+    # Names are compared loosely: upper and lower case and a suffix make no difference.
     known = {_loose(name): name for name in files} | {name: name for name in files}
     plain = {name: inside(f"{path}: {key}", name) for name in names}
     found = {name: known.get(file, known.get(_loose(file))) for name, file in plain.items()}

@@ -24,7 +24,7 @@ from gsstream.input.recordings.recorded import Recording, SeenPoints
 
 TRAIN, TEST, IMAGES, POINTS = "train_meta.json", "test_meta.json", "ims", "init_pt_cld.npz"
 
-#: As Dynamic 3D Gaussians writes it.
+#: Keys that Dynamic 3D Gaussians writes.
 _KEYS = Keys(read=("w", "h", "k", "w2c", "fn", "cam_id"), idle=("near", "far"), refused=("dist", "distCoef", "fisheye"))
 
 

@@ -24,7 +24,7 @@ from gsstream.input.recordings.rigs.camera import RigCamera, opencv_lens
 SUFFIXES = (".yml", ".yaml")
 
 
-#: As OpenCV's samples, MC-Calib's and ROS's tools write it.
+#: Keys that OpenCV's samples, MC-Calib and the tools of ROS write.
 _KEYS = Keys(
     read=(
         "camera_matrix",

@@ -20,7 +20,7 @@ from gsstream.input.recordings.poses import from_pixel_centers, from_rotation_ve
 from gsstream.input.recordings.rigs.camera import RigCamera, opencv_lens
 
 SUFFIXES = (".toml",)
-#: Of a camera, as Anipose, Pose2Sim and Caliscope write it.
+#: Keys of a camera that Anipose, Pose2Sim and Caliscope write.
 _KEYS = Keys(
     read=(
         "name",

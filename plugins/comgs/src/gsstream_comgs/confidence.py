@@ -30,7 +30,7 @@ class ErrorGradient(ConfidenceEstimator):
         total = torch.zeros_like(context.gaussians.opacities)
         for view in range(len(context.cameras)):
             error = context.previous_render(view) - context.image(view)
-            check_finite(f"error of view {view} at frame {context.index}", error)  # the sign of what is not, is 0
+            check_finite(f"error of view {view} at frame {context.index}", error)  # the sign of NaN would be 0
             total += context.screen_gradient(view, error.sign() / error.numel()).gradient.norm(dim=1)
         number = min(max(1, int(self.config.share * len(total))), int((total > 0).sum()))
         logits = torch.full_like(total, LEFT)

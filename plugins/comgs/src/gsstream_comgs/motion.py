@@ -19,7 +19,7 @@ from gsstream.blocks import (
 )
 from gsstream_comgs.influence import KeyPoints, field_of
 
-#: Share of its views in which a Gaussian must lie in what changed.
+#: Least share of the views that show a Gaussian in which it must lie in changed tiles, to take part.
 VOTES = 0.75
 #: Adam's learning rate of what a key point influences: log sizes and a quaternion.
 LR_INFLUENCE = 0.02

@@ -107,7 +107,7 @@ def update_views(views: Sequence[CachedView], ids: Ids, rows: SplatArrays, backg
     rows = require_splats(rows, len(ids))
     for view in views:
         view.scenes += 1
-        view.rasterizer.forget()  # what it kept for a backward pass is not there any more afterwards
+        view.rasterizer.forget()  # afterwards no backward pass of an earlier forward is possible
     targets = [(view.rasterizer.handle, view.image, view._transmittance) for view in views]
     raise_on_faults(_native.update_views(targets, ids, native_scene(rows), background), rows)
 

@@ -102,7 +102,7 @@ def _at_most_rough(spread: float, means: FloatArray) -> float:
         _second_differences(means[:, :-2], means[:, 1:-1], means[:, 2:], out)
     # The variance of a - 2 b + c is six times that of each.
     admitted = ChangeRule.MOST_OF_ROUGHNESS * ChangeRule.MAD_TO_SIGMA / np.sqrt(6)
-    # Usually it admits more than the spread, and to see that takes counting alone; the margin is for rounding.
+    # Usually the bound is above the spread, and counting alone shows that; the margin is for rounding.
     if np.count_nonzero(values < spread / admitted * (1 + 1e-9)) < len(values) // 2:
         return spread
     return min(spread, float(ChangeRule.MOST_OF_ROUGHNESS * ChangeRule.MAD_TO_SIGMA * median(values) / np.sqrt(6)))

@@ -76,14 +76,14 @@ class CpuSession(RenderSession):
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
         upstream = as_array("image_gradient", image_gradient.contiguous())
         splats = splats_of(self._gaussians)
-        cached = self._view(view)  # its owner while the native call runs
+        cached = self._view(view)  # keeps the rasteriser alive while the native call runs
         gradient, visible = cached.rasterizer.backward_cached(splats, upstream)
         return ScreenGradient(torch.from_numpy(gradient), torch.from_numpy(visible))
 
     def screen_gradient_rows(self, view: int, image_gradient: torch.Tensor) -> RowGradient:
         upstream = as_array("image_gradient", image_gradient.contiguous())
         splats = splats_of(self._gaussians)
-        cached = self._view(view)  # its owner while the native call runs
+        cached = self._view(view)  # keeps the rasteriser alive while the native call runs
         rows, gradient = cached.rasterizer.backward_cached_rows(splats, upstream)
         return RowGradient(torch.from_numpy(rows), torch.from_numpy(gradient))
 
@@ -91,7 +91,7 @@ class CpuSession(RenderSession):
         check_tiles(tiles, (self._cameras.height, self._cameras.width))
         if not bool(tiles.any()):
             return torch.zeros(len(self._gaussians), dtype=torch.bool)
-        cached = self._view(view)  # its owner while the native call runs
+        cached = self._view(view)  # keeps the rasteriser alive while the native call runs
         return torch.from_numpy(cached.rasterizer.contributing_in_cache(as_array("tiles", tiles)))
 
     def visible_anywhere(self, tiles: torch.Tensor) -> torch.Tensor:
@@ -142,7 +142,7 @@ class CpuSession(RenderSession):
         return super().loss_and_grad(view, target, wrt) if found is None else found
 
     def _by_rows(self, view: int, target: ViewTarget, wrt: WrtRows) -> LossAndGrad[Gaussians[torch.Tensor]]:
-        cached = self._view(view)  # its owner while the native call runs
+        cached = self._view(view)  # keeps the rasteriser alive while the native call runs
         assert self._ids is not None
         cached.freeze(self._ids, None)
         return cached.loss_and_grad(wrt.values, target)
@@ -197,12 +197,14 @@ class CpuSession(RenderSession):
         cached = self._views.get(view)
         if cached is None:
             kept = view not in self._refused
-            # Memory of its own where memory counts: what the pool lends is as large as its former owners needed.
+            # Where memory is limited, a rasteriser of its own: one of the pool has as much memory as its former users
+            # needed.
             held = self._lease(view, own=kept and self._budget is not None)
             cached = CachedView(held, splats_of(self._gaussians))
             if kept:
                 self._views[view] = cached
-        # What passes work in grows with them, so a view that fitted when it came may have to go later.
+        # The working memory of a view grows with its passes, so a view that fitted into the budget at first may not
+        # later.
         if self._budget is not None and view in self._views and self.cache_bytes().total > self._budget:
             self._refused.add(view)
             del self._views[view]

@@ -32,9 +32,9 @@ from gsstream.blocks import (
     rounded_motion,
 )
 
-#: The box whose volume the cells share holds this part of the Gaussians along each axis.
+#: Quantiles of the centres along each axis at which the box ends whose volume gives the side of the cells.
 BOX = (0.05, 0.95)
-#: Share of its views in which a Gaussian must lie in what changed.
+#: Least share of the views that show a Gaussian in which it must lie in changed tiles, to take part.
 VOTES = 0.75
 
 

@@ -22,9 +22,9 @@ from gsstream.packet import PacketKind, PlayerState, StreamReader, decode_packet
 
 #: Raw opacity below which a Gaussian is not looked for: it shows less than a tenth of its colour.
 FAINT = -2.2
-#: Way on the screen below which a Gaussian counts as not moved, pixels.
+#: Distance on the screen below which a Gaussian counts as not moved, pixels.
 UNMOVED = 1.0
-#: A body is seen by so many cameras; less say nothing of where a point lies.
+#: Least number of cameras that must see a body: fewer do not say where a point of it lies.
 LEAST_CAMERAS = 2
 #: Share of the cameras with a point in their picture that must see a change there: what moves may have by chance the
 #: colour that was there before.

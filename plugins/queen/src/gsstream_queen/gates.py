@@ -10,7 +10,7 @@ from gsstream_queen.settings import GateSettings
 
 #: Ends of the interval that the sigmoid is stretched to (published gamma and eta).
 GAMMA, ETA = -0.5, 1.01
-#: Logits are kept within ln 1000: a gate can be surer than that of nothing (released code of the family).
+#: Logits are kept within ln 1000, so that no gate is surer than that (released code of the family).
 BOUND = math.log(1000.0)
 
 

@@ -42,7 +42,7 @@ from gsstream_recon.anchors import AnchorLevels, Level, bound, followed, inherit
 RATIO = 3.0
 #: Old anchors from which a new anchor inherits its motion.
 NEIGHBOURS = 3
-#: Share of its views in which a Gaussian must lie in what changed.
+#: Least share of the views that show a Gaussian in which it must lie in changed tiles, to take part.
 VOTES = 0.75
 
 

@@ -37,7 +37,7 @@ def minmax(values: torch.Tensor, limit: float) -> torch.Tensor:
     below, above = values - values.min(), values.max() - values
     if float(below.max()) == 0.0:
         return torch.zeros_like(values)
-    # The ends are +-infinity; they are given their limit by name, not by the caller's clamp.
+    # At both ends the logit is infinite: they get the limit here, and not only by the clamp of the caller.
     logits = torch.log(below) - torch.log(above)
     logits = logits.where(below > 0, torch.full_like(values, -limit))
     return logits.where(above > 0, torch.full_like(values, limit))

@@ -100,7 +100,8 @@ class ViewSpaceGradient(ConfidenceEstimator):
     traits = ConfidenceTraits(needs_renderer=True, finds_motion=True, monotone_in_change=True)
 
     def claims(self) -> ConfidenceTraits:
-        # Normalised by its own statistics, a change may look weaker as all others grow: the default is checked to rise.
+        # A change that is normalised by its own statistics may look weaker as all others grow; so only the default
+        # setting is checked to rise.
         rises = self.config.normalisation == "robust"
         return replace(
             self.traits, floor=self.config.floor, monotone_in_change=rises, brightness=2.0 if rises else None
@@ -199,7 +200,7 @@ class ViewSpaceGradient(ConfidenceEstimator):
     def _noise_upstream(self, context: FrameContext, view: int) -> torch.Tensor:
         """The upstream gradient that the camera's noise alone could have given: one seeded draw."""
         before = context.previous_image(view)
-        # By the name of the camera: its noise is the same in whatever order cameras are asked.
+        # The random stream is named after the camera, so that its noise does not depend on the order of cameras.
         name = context.cameras.ids[view]
         generator = Rng(self.config.seed).stream(f"s2gs/view-gradient/noise/{name}", context.index)
         draw = torch.randn(before.shape, generator=generator, dtype=before.dtype).to(before.device)

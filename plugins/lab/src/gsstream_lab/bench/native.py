@@ -72,7 +72,7 @@ def measure_peaks(native: NativeBench | None, threads: tuple[int, ...], known: d
         return known
     found = dict(known)
     for count in threads:
-        # Many short looks: some of them fall between the work of other programs.
+        # Many short measurements: some of them fall between the work of other programs.
         gflops = max(native.fma_peak(count, 0.004) for _ in range(MEASURED))
         gbytes = max(native.copy_peak(count, 64.0) for _ in range(MEASURED // 4))
         if count in known:

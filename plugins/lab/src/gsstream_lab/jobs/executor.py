@@ -91,7 +91,7 @@ def _serve(pipe: Connection, work: Work, job: Any, environment: Mapping[str, str
     # Ctrl-C reaches the whole group; the sweep decides what becomes of its workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_die_with_parent, daemon=True).start()
-    # One line, as the command says its own warnings, without a place in somebody's installation.
+    # One line, as the command prints its own warnings: without the path of an installed file.
     warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
     pipe.send(work(job))
 

@@ -72,7 +72,7 @@ QUANTITIES: tuple[Quantity, ...] = (
 )
 BY_KEY: Mapping[str, Quantity] = {quantity.key: quantity for quantity in QUANTITIES}
 DRAWN_QUALITIES = ("psnr", "psnr_moving", "psnr_changed")
-#: Pairs of a quality and what it is weighed against.
+#: Pairs of quantities that a chart sets against each other: a quality, and its cost.
 QUALITIES, COSTS = ("psnr", "psnr_moving"), ("kb", "seconds", "cpu_seconds", "memory", "joules")
 
 

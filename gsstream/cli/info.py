@@ -20,7 +20,7 @@ def info(
 ) -> None:
     """Say what a stream holds: method, cameras, packets and their sizes.
 
-    Beside the sizes stands what they could be at best.
+    Each size is printed beside the least that it could be.
     """
     file = stream_file(stream)
     from gsstream.evaluation.stream_stats import stream_stats

@@ -56,7 +56,7 @@ class RecipeOptions:
 
 @dataclass(frozen=True)
 class ShownOptions:
-    """What is shown of a run besides the stream."""
+    """Options that say what is shown of a run besides the stream."""
 
     no_video: Annotated[bool, typer.Option("--no-video", help="Write no video, only still pictures.")] = False
     no_pictures: Annotated[

@@ -122,7 +122,7 @@ def _reused_lines(
 def meant_for(uri: str) -> str | None:
     """Return the name of the recipe that is meant for a recording, by its layout; None where there is none.
 
-    ``uri``: of a recording that can be opened. Raises SourceError for a folder whose layout is not known.
+    ``uri``: address of a recording that can be opened. Raises SourceError for a folder whose layout is not known.
     """
     from gsstream.input.recordings.detect import LAYOUTS, detect
     from gsstream.recipe.shipped import OF_LAYOUT

@@ -89,7 +89,7 @@ def prepare(
 
 
 def _tell(made: Prepared, found: list[Finding]) -> None:
-    """What the user has to know of a scene that was made."""
+    """Lines that a user has to know about the scene that was made."""
     for finding in found:
         typer.echo(f"{finding.severity}: [{finding.code}] {finding.message}", err=True)
     if made.points is None:

@@ -18,7 +18,7 @@ ROUNDING = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """How a frame of a recording that is still being written came in."""
+    """The way a frame of a recording that is still being written arrived."""
 
     #: When its last image was complete, by the time of modification of that file: seconds since 1970. None when its
     #: files are gone already.
@@ -39,7 +39,7 @@ class Frame:
         epoch_scale: share of the recipe's epochs that this frame is worth, in [0, 1]. A live source lowers it when the
             run falls behind; 0 asks for an empty packet, so that numbering and time go on. Frame 0 is always done in
             full.
-        arrival: how it came in; None for a recording that is not live.
+        arrival: how the frame arrived; None for a recording that is not live.
     """
 
     index: int

@@ -46,9 +46,9 @@ def sh_basis(directions: FloatArray, degree: int) -> FloatArray:
 def rotate_sh(shN: FloatArray, rotation: FloatArray) -> FloatArray:
     """Return coefficients [N, K - 1, 3], of degree 1 and above, of the same colours after the world was turned.
 
-    What was seen from direction d is seen from ``rotation @ d`` afterwards, ``rotation`` [3, 3]. Harmonics of one
-    degree turn among themselves, so each degree has a matrix, found from their values in more directions than there are
-    coefficients.
+    The colour that was seen from direction d is seen from ``rotation @ d`` afterwards, ``rotation`` [3, 3]. Harmonics
+    of one degree turn among themselves, so each degree has a matrix, found from their values in more directions than
+    there are coefficients.
     """
     degree = round((shN.shape[1] + 1) ** 0.5) - 1
     turned = np.array(shN, np.float64)

@@ -1,4 +1,4 @@
-"""Part: what all kinds have in common. Abstract or final; configured once; no mutable state."""
+"""Part: the base class of all kinds of parts. Abstract or final; configured once; no mutable state."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Part(ABC):  # noqa: B024 - each kind adds what is abstract
 
     State and noise are arguments and results, never attributes: after construction no attribute may be set.
 
-    ``source``: where the idea is from, for listings: a citation such as ``"S2GS, section 3.2"``, or the name of the
+    ``source``: origin of the idea, for listings: a citation such as ``"S2GS, section 3.2"``, or the name of the
     distribution that had it first.
 
     ``processor_only``: why the part cannot work with tensors of a GPU; empty where it can. A run with it renders on the

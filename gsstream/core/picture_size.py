@@ -1,4 +1,4 @@
-"""What settings that are given for small pictures become in larger ones, so that a recipe fits every size.
+"""Settings are given for small pictures; these rules adapt them to larger ones, so that a recipe fits every size.
 
 Lengths in pixels, the price of a bit and the thresholds of growth are chosen on pictures 320 pixels wide. A wider
 picture of the same scene shows everything larger and more of its detail, so each setting follows the width by a rule of
@@ -42,7 +42,8 @@ def enlargement(width: int) -> float:
 def bit_price_factor(pixels: int) -> float:
     """Return the factor on the price of a bit, which is divided by the pixels of a view.
 
-    Without it a bit would become cheaper as fast as pixels become more, though what moves is not seen better for it.
+    Without this factor a bit would become cheaper in proportion to the number of pixels, though the picture shows a
+    motion no better for it.
     """
     return math.pow(max(1.0, pixels / PIXELS), 0.75)
 
@@ -50,8 +51,8 @@ def bit_price_factor(pixels: int) -> float:
 def densify_factor(width: int) -> float:
     """Return the factor on the mean screen gradient, in half image widths, above which a Gaussian is densified.
 
-    A Gaussian of a given number of pixels has a smaller part in the mean over a larger picture. Where what is covered
-    has a price (:func:`area_price`), a lower threshold gives back the Gaussians that the price takes.
+    A Gaussian of a given number of pixels has a smaller part in the mean over a larger picture. Where covered area has
+    a price (:func:`area_price`), a lower threshold restores the Gaussians that the price removes.
     """
     return math.pow(enlargement(width), -0.5) * math.pow(0.8, largeness(width))
 

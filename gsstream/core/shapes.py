@@ -40,7 +40,7 @@ def check_shape(name: str, array: Any, expected: Sequence[int | str]) -> dict[st
     """Check the shape of an array; letters of the expected shape bind to sizes.
 
     Arguments:
-        name: of the array, for the error.
+        name: name of the array, for the error.
         array: anything with a ``shape``.
         expected: sizes, letters that bind to sizes, or ``...``.
 

@@ -181,7 +181,7 @@ def _reduced(image: FloatArray | None, factor: int) -> FloatArray | None:
 
 
 def _alone(path: Path, frame: int, rig: Cameras, renderer: PlayerRenderer | None) -> FloatArray:
-    """What a camera sees of a frame's fresh reconstruction."""
+    """The picture of a frame's fresh reconstruction as a camera sees it."""
     with Playback(path) as playback:
         return np.clip(
             render(playback.state_at(frame), rig, 0, background=playback.meta.background, renderer=renderer), 0, 1

@@ -152,7 +152,7 @@ class Shown(Protocol):
 
 
 class StreamFrames:
-    """What the player shows of a stream."""
+    """Pictures of a stream as the player shows them."""
 
     def __init__(self, playback: Playback, rig: Cameras, renderer: PlayerRenderer) -> None:
         self.rig, self.renderer, self.frames = rig, renderer.name, playback.frames

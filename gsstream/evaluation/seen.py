@@ -1,8 +1,8 @@
 """Which pixels of a test camera show a surface that training cameras see: the others can only be guessed.
 
-What no training camera looks at stands in a picture by chance. On a recording of large pictures 4 % of the pixels held
-half of the squared error, and their chance turned rankings round (docs/results/extremes.md). The surface is that of the
-decoded scene: its own depth, drawn for the test camera and for every training camera.
+A surface that no training camera sees looks in a picture as chance will have it. On a recording of large pictures 4 %
+of the pixels held half of the squared error, and their chance turned rankings round (docs/results/extremes.md). The
+surface is that of the decoded scene: its own depth, drawn for the test camera and for every training camera.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ class Field:
     """What one frame learned.
 
     Arguments:
-        shape: of the grid and the network.
+        shape: sizes of the grid and the network.
         marks: [N] uint8, 1 for rows that move where they lie in the box; None: all rows in the box.
         entries: for each level [E, F] int32 symbols of the entries that those rows touch, ascending.
         weights: for each layer [inputs, outputs] int32 symbols.

@@ -88,7 +88,7 @@ class Controller:
 
 
 def _phases(step: Step[Any], allowed: FrameBudget, log: FrameLog) -> dict[str, Any]:
-    """What a frame used, by its phases and its packet."""
+    """The seconds and bytes that a frame used, read from its phases and its packet."""
     return {
         "rd_lambda": allowed.rd_lambda,
         "estimate": 0.0,
@@ -103,8 +103,8 @@ def _phases(step: Step[Any], allowed: FrameBudget, log: FrameLog) -> dict[str, A
 def spent(plan: FrameBudget, used: Mapping[str, Any], stream: Stream, epochs: float) -> dict[str, Any]:
     """Return the entry ``budget`` of a frame, before its limits and the cost of the whole frame are added.
 
-    ``used`` is that of :meth:`EpochScheduler.usage`, with the seconds of what fits by itself as ``parts``; ``stream``
-    holds the recipe's own settings, from which the plan departed.
+    ``used`` is that of :meth:`EpochScheduler.usage`, with the seconds of parts that fit by themselves as ``parts``;
+    ``stream`` holds the recipe's own settings, from which the plan departed.
     """
     reduced: dict[str, Any] = {}
     if plan.max_bytes is not None:

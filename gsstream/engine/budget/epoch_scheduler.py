@@ -92,7 +92,7 @@ class EpochScheduler:
     def weigh_bytes(self, estimate: float) -> None:
         """Move the weight of the rate by the bytes that a pass would have sent, before their correction.
 
-        Without a limit on bytes it stays.
+        Without a limit on bytes the weight stays.
         """
         if (limit := self.budget.max_bytes) is None:
             return
@@ -107,7 +107,7 @@ class EpochScheduler:
 
     @property
     def mean_rate_weight(self) -> float:
-        """Geometric mean over the last half of the passes: what the bytes of the frame answer to."""
+        """Geometric mean of the weight over the last half of the passes, which decides the bytes of the frame."""
         last = self._weights[len(self._weights) // 2 :] or [self.rd_lambda]
         return math.exp(sum(map(math.log, last)) / len(last)) if min(last) > 0 else self.rd_lambda
 
@@ -126,7 +126,8 @@ class EpochScheduler:
     def _left(self) -> float:
         """Seconds for passes since the clock was read last.
 
-        What follows them is not known before a frame has shown it: until then it is taken for one more pass.
+        The time of what follows the passes is not known before a frame has shown it: until then it is taken to be that
+        of one pass.
         """
         seconds, after = self._seconds, self.budget.after
         kept = min(self._each, UNKNOWN_RESERVE * seconds) if after is None else after
@@ -161,9 +162,9 @@ class EpochScheduler:
 def next_rate_weight(weight: float, expected: float, wanted: float) -> float:
     """Return the weight of the rate after a pass that would send more or fewer bytes than are wanted.
 
-    Bytes fall with about the square root of the weight, so the first power leads half of the way to
-    the goal; a factor of three a pass is the most that residuals can follow. What was taken back comes slowly
-    again, so the way down is half as fast.
+    Bytes fall with about the square root of the weight, so the first power leads half of the way to the goal; a factor
+    of three a pass is the most that residuals can follow. Symbols that a high weight has removed come back slowly, so
+    the weight falls half as fast as it rises.
     """
     factor = min(max(expected / wanted, 1 / 9), 3.0)
     factor = factor if factor > 1 else factor**0.5

@@ -34,7 +34,7 @@ class TrimmedDelta:
         packet: its packet.
         whole: what was asked for.
         untrimmed: bytes of the packet of ``whole``.
-        layout: of the scene before it.
+        layout: layout of the scene before the packet.
     """
 
     delta: Delta

@@ -68,8 +68,9 @@ def prune_by_error(
 ) -> torch.Tensor:
     """Return the rows [K] int64, in order, that remain when those go that the training images would not miss.
 
-    What one may do without, all together may not: of ten equal Gaussians none is missed. So where the images are off by
-    ``GROWTH`` times as much without all of them, only those go that are missed less.
+    Gaussians that are dispensable one by one may not be so together: of ten equal ones none is missed. So where the
+    error of the images without all of them is more than ``GROWTH`` times as large, only Gaussians of a smaller error
+    are removed.
     """
     errors, error = removal_errors(views, gaussians, generator, probes=HUTCHINSON_SAMPLES)
     for _ in range(TRIES):

@@ -1,10 +1,10 @@
 """A first frame that was made in few iterations goes on being optimised while later frames run (stream.refine_frames).
 
 The fit is that of frame 0, from the first key packet on: densification, pruning and falling rates over all of its
-iterations, some in every frame, each on the pictures of that frame. What the stream moves is moved here, too: a
-Gaussian that came of another one goes where that one goes. Nothing of it is sent before the last iteration: then a key
-packet brings the scene (``engine.keys.keyframes``). So a frame's iterations follow its packet, which does not wait for
-them; those of the last frame precede it, because that packet brings what they make.
+iterations, some in every frame, each on the pictures of that frame. Motions of the stream are applied here, too: a
+Gaussian that was split or copied from another one moves with that one. Nothing of it is sent before the last iteration:
+then a key packet brings the scene (``engine.keys.keyframes``). So a frame's iterations follow its packet, which does
+not wait for them; those of the last frame precede it, because that packet brings what they make.
 """
 
 from __future__ import annotations

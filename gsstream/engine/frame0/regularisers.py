@@ -56,9 +56,9 @@ class Dropout:
     Which ones is drawn for some iterations at a time, so that what is drawn crosses to a GPU once in a while.
 
     Arguments:
-        share: of the Gaussians that is left out, 0 to below 1.
+        share: share of the Gaussians that is left out, 0 to below 1.
         ahead: number of iterations that are drawn for at a time.
-        generator: of the draws; it is used only where something is left out.
+        generator: random generator of the draws; it is used only where something is left out.
     """
 
     def __init__(self, share: float, ahead: int, generator: torch.Generator) -> None:

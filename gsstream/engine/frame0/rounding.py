@@ -24,8 +24,8 @@ _Near = Callable[[IntArray], IntArray]
 def rd_codes_to_zero(exact: FloatArray, sensitivity: FloatArray, weight: float) -> IntArray:
     """Return the codes [N, width] int32 with the least ``sensitivity (code - exact)^2 + weight bits``, by column.
 
-    Of each value: the nearest code, its two neighbours towards zero, and zero, for what may as well not be there. The
-    bits of a code are those of a coder that knows how often each one occurs in its column.
+    The codes that each value may take: the nearest, its two neighbours towards zero, and zero. The bits of a code are
+    those of a coder that knows how often each one occurs in its column.
     """
 
     def candidate_codes(nearest: IntArray) -> IntArray:

@@ -59,7 +59,7 @@ class EncodedFrame:
     """A frame that is encoded.
 
     Arguments:
-        state: of the method after the frame; ``state.player`` is what every player has.
+        state: state of the method after the frame; ``state.player`` is what every player has.
         packet: what a player reads.
         status: kind of the packet.
         metrics: what the frame cost: its line of ``metrics.jsonl``.

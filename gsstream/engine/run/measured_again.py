@@ -22,8 +22,8 @@ def measure_again(
 ) -> Iterator[dict[str, Any]]:
     """Yield a line for each of these frames of a stream, which ascend.
 
-    A line holds what packet and recording say: sizes, counts and quality. What only the encoder knew (seconds,
-    iterations, latency) is gone with it. ``held_out``: None where the run measures nothing.
+    A line holds what packet and recording say: sizes, counts and quality. Numbers that only the encoder knew (seconds,
+    iterations, latency) are lost. ``held_out``: None where the run measures nothing.
     """
     player: PlayerState | None = None
     with StreamReader(stream) as reader:

@@ -55,7 +55,7 @@ def trim_metrics(path: Path, last: int) -> list[dict[str, Any]]:
 def append_metrics(path: Path, line: dict[str, Any]) -> None:
     """Add the record of one frame, in one write. Raises OutputError when there is no room for it, or no file.
 
-    A run makes the file when it begins: one that is gone since has taken the lines of earlier frames with it. A line
+    A run makes the file when it begins: where the file is missing later, the lines of earlier frames are lost. A line
     that was only written in part is taken back, so that what follows does not stand behind half of one.
     """
     data = (json.dumps(line) + "\n").encode()

@@ -27,7 +27,7 @@ def open_recording(uri: str, recipe: Recipe, catalog: Catalog) -> Source:
 
     Arguments:
         recipe: its scale and section ``data``.
-        catalog: of the sources that are installed.
+        catalog: catalogue of the sources that are installed.
         uri: "demo", "synthetic:...", a folder, or "NAME:..." where NAME is a part of the kind "source".
 
     Raises:

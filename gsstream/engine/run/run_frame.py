@@ -112,7 +112,7 @@ def _tried(
 
 
 def _given(method: StreamingMethod[Any], frame: Frame) -> Frame:
-    """What the method is given: images of float32, as methods expect them, unless it is the engine's own."""
+    """The frame as the method is given it: with images of float32, unless the method is the engine's own."""
     return frame if isinstance(method, PartsMethod) else frame.as_float32()
 
 

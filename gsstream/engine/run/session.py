@@ -211,7 +211,7 @@ class _Run:
         add_metrics(self.out / METRICS, kept, lines)
 
     def _restore_metrics(self, done: int) -> None:
-        """What the frames before ``done``, which are not made here, say about noise and about what moves."""
+        """Noise and moving pixels of the frames before ``done``, which this session does not encode."""
         if self.held_out and len(self.source.info.test):
             second = self.source.frame(1, "test") if done > 1 else None
             self.held_out.remember(self.source.frame(0, "test"), second)

@@ -67,7 +67,7 @@ class EngineContext:
 
     @property
     def session(self) -> RenderSession:
-        """The render session of this scene: what the last frame or a part made it project is not done again."""
+        """The render session of this scene, with what the last frame or a part has projected already."""
         if self._session is None:
             self._session = self._assembly.renderer.open(self._gaussians, None, self.cameras, self._background)
         return self._session

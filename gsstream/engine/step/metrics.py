@@ -37,7 +37,8 @@ def _cache(session: RenderSession | None) -> dict[str, Any]:
 def log_packet(log: FrameLog, player: PlayerState, packet: EncodedPacket) -> None:
     """Log the sizes and counts that follow from a packet and the state it was decoded to.
 
-    Of a key packet that takes the place of a delta packet only sizes are logged: what changed in the frame stays.
+    Of a key packet that takes the place of a delta packet only sizes are logged; the counts stay those of the delta
+    packet.
     """
     sizes = {
         "bytes": dict(packet.sizes),

@@ -1,4 +1,4 @@
-"""What is known of raw cameras before anything is matched: the poses and lenses of a calibration, in any layout."""
+"""Poses and lenses of raw cameras that are known before anything is matched: those of a calibration, in any layout."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Do all cameras show the same instants? Motion on epipolar lines is compared between cameras at shifted times.
 
 A camera that is most like all others some frames earlier or later has a clock that is off; two cameras that are like
-the others only with each other's pose are swapped. Where motion is too little, or too steady, to tell, that is said.
+the others only with each other's pose are swapped. A finding says so where there is too little motion, or too steady a
+motion, to tell.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ SUSPECTS, STAND_OUT, EXCHANGED = 6, 0.92, 0.1
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """One camera is so many frames ``late``; None: not known. ``ended``: the best lies at the end of the search."""
+    """By how many frames one camera is ``late``; None: not known. ``ended``: the best lies at the end of the search."""
 
     late: float | None
     ended: bool = False

@@ -31,7 +31,7 @@ class SourceInfo:
 
     Arguments:
         name: short name.
-        uri: how it was asked for.
+        uri: the address by which it was opened.
         num_frames: number of frames, or None while it grows.
         fps: frames per second.
         train, test: cameras by split; test cameras never enter seeding or training.
@@ -57,7 +57,7 @@ class Moment:
 
     Arguments:
         epoch_scale: share of the recipe's epochs that the frame is worth, in [0, 1].
-        arrival: how the frame came in; None for a recording that is not live.
+        arrival: how the frame arrived; None for a recording that is not live.
         held: ids of the cameras whose image is of an earlier instant.
     """
 
@@ -202,8 +202,9 @@ class Wrapped(Source):
 def assembled(source: Source, index: int, split: Split, read: Callable[[int, str], Any] | None = None) -> Frame:
     """Return a frame made of single stored images: ``source.stored_image`` of its cameras, or what ``read`` gives.
 
-    No whole frame is float32 on the way to one of uint8. Test cameras are left out of an instant in which one of them
-    holds an earlier image, so that nothing is measured against an image of another time.
+    A frame of uint8 is made picture by picture: no whole frame of float32 is held for it. Test cameras are left out of
+    an instant in which one of them holds an earlier image, so that nothing is measured against an image of another
+    time.
     """
     moment, info = source.moment(index), source.info
     check_index(info, index)

@@ -20,7 +20,7 @@ FARTHEST = 1e12
 def recording_similarity(source: Source) -> World:
     """Return the world that a recording's cameras define, training and test cameras together.
 
-    So it does not depend on the split.
+    So the coordinates do not depend on the split.
     """
     train, test = source.info.train, source.info.test
     rig = train.joined(test)

@@ -118,7 +118,7 @@ class VideoClip:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What the file says of its pictures that a run does nothing about, each with what to do."""
+        """Properties of the pictures that the file states and a run ignores, each with the remedy."""
         return self._doubts
 
     @property

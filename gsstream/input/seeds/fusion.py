@@ -14,7 +14,7 @@ from gsstream.input.seeds.geometry import pixel_centers
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """What the other views say about every pixel's point; all [C, H, W] int16.
+    """Number of other views that support or contradict every pixel's point; all [C, H, W] int16.
 
     Arguments:
         support: views whose own depth there agrees.

@@ -62,8 +62,8 @@ def reconstruct(
 ) -> Mapping:
     """Map C images [H, W, 3] in [0, 1] of one instant; of different sizes, unless they share a lens.
 
-    ``names``: of the cameras, for messages. The same input gives the same result. Raises InputError when pycolmap is
-    missing, and, with the matches of each pair, when it finds nothing to begin with.
+    ``names``: names of the cameras, for messages. The same input gives the same result. Raises InputError when pycolmap
+    is missing, and, with the matches of each pair, when it finds nothing to begin with.
     """
     if model not in LENSES:
         raise InputError(f"lens model: expected one of {', '.join(LENSES)}, got {model!r}")
@@ -95,7 +95,7 @@ def _apart(pairs: IntArray, counts: IntArray, names: Sequence[str]) -> str:
 def triangulate(images: FloatArray, cameras: Cameras, *, timeout: float = 1800.0, tell: Tell = silent) -> Mapping:
     """Triangulate points of [C, H, W, 3] images in [0, 1] with known poses and pinhole lenses.
 
-    Each comes with what every camera saw.
+    Each point comes with the pixel at which every camera saw it.
     """
     with tempfile.TemporaryDirectory(prefix="gsstream-sfm-") as name:
         folder = Path(name)

@@ -63,7 +63,7 @@ class Search(NamedTuple):
 
     @property
     def total(self) -> int:
-        """All places, those that lie outside of what is allowed included."""
+        """All places, also those that lie outside of the allowed range."""
         return self.starts + self.tries
 
 

@@ -53,8 +53,8 @@ def photo_consistent_seeds(
     A rig that looks inwards from around stands in a room; where the sweep is not sure, points lie on its walls.
 
     Arguments:
-        known: [C, H, W] planar depth of the recording's depth maps, NaN where nothing is known: what is known goes
-            before what is found, and where every camera has a map nothing is looked for.
+        known: [C, H, W] planar depth of the recording's depth maps, NaN where nothing is known: known depths take
+            precedence over found ones, and where every camera has a map no depth is searched for.
 
     Raises InputError for fewer than three cameras, unless all have a depth map, and when no two views agree anywhere.
     """

@@ -78,7 +78,8 @@ def in_shell(means: FloatArray, scales: FloatArray, shell: Shell) -> BoolArray:
     """Return [N] bool: which Gaussians are what became of the sphere's seeds.
 
     Arguments:
-        means: [N, 3] centres. scales: [N, 3] log standard deviations. shell: of the training cameras.
+        means: [N, 3] centres. scales: [N, 3] log standard deviations. shell: sphere that belongs to the training
+            cameras.
     """
     far = ((means - shell.center) ** 2).sum(1) >= (BEYOND * shell.radius) ** 2
     found: BoolArray = far & (scales.max(1) >= math.log(WIDE * shell.sigma))

@@ -91,7 +91,8 @@ def assembled_rig(
 def opencv_lens(values: Sequence[float], fisheye: bool, where: str) -> Lens:
     """Return the lens of OpenCV's coefficients: k1, k2, p1, p2, k3, k4, k5, k6, or k1 to k4 of a fisheye.
 
-    Of 12 or 14, those behind the eighth must be zero; zeros alone are no lens, however many there are.
+    Of 12 or 14 coefficients, those behind the eighth must be zero; a lens of zeros alone is none, however many there
+    are.
     """
     if fisheye and len(values) == 4:
         return Lens("fisheye", tuple(values))

@@ -71,7 +71,7 @@ def check_protocol(name: str, info: SourceInfo, leak: str, frames: Sequence[int]
     """Refuse what is measured otherwise than the protocol says.
 
     Arguments:
-        name: of the protocol.
+        name: name of the protocol.
         info: the recording as it was used, after scale and split.
         leak: ``data.leak`` of the run: what its test cameras gave to it.
         frames: to be evaluated, ascending: the first one and those after it, at most as many as the protocol has.

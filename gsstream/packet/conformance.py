@@ -34,8 +34,8 @@ class Case:
     """One stream of the suite.
 
     Arguments:
-        name: of the case.
-        path: of its stream.
+        name: name of the case.
+        path: file of its stream.
         features: what it needs of a decoder, the one it is there for first.
         rules: identifiers of docs/spec that it tests.
         frames: the lines that a decoder prints, one for each frame that can be played.

@@ -169,7 +169,7 @@ def make_case(name: str, before: Scene, cameras: Cameras, *, shift: float = 0.0)
     """Return a world whose Gaussians with x > 0.3 and in view move by ``shift`` between the frames.
 
     Arguments:
-        name: of the world.
+        name: name of the world.
         before: its Gaussians in the frame before.
         cameras: that see it.
         shift: [3] scene units.

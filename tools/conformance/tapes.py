@@ -28,7 +28,7 @@ class Vector:
     """A stream of the suite.
 
     Arguments:
-        name: of its file.
+        name: name of its file.
         features: what it needs of a decoder, the one it is there for first.
         rules: identifiers of docs/spec that it tests.
         data: the file.

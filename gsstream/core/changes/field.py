@@ -34,8 +34,8 @@ class Field:
         marks: [N] uint8, 1 for rows that move where they lie in the box; None: all rows in the box.
         entries: for each level [E, F] int32 symbols of the entries that those rows touch, ascending.
         weights: for each layer [inputs, outputs] int32 symbols.
-        entry_step: of the symbols of entries, whole number of 2^-20.
-        weight_step: of the symbols of weights, whole number of 2^-14.
+        entry_step: step of the symbols of entries, whole number of 2^-20.
+        weight_step: step of the symbols of weights, whole number of 2^-14.
     """
 
     shape: FieldShape
@@ -56,7 +56,7 @@ def field_rows(scene: Scene, shape: FieldShape, marks: IntArray | None) -> tuple
 
     Arguments:
         scene: decoded, as both ends have it.
-        shape: of the field.
+        shape: shape of the field.
         marks: [N] uint8, 1 for rows that move where they lie in the box; None: all rows in the box.
 
     Raises ShapeError when the marks do not fit the scene or the field would take too long.

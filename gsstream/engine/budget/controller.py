@@ -56,7 +56,7 @@ class Controller:
         """Log what a finished frame cost, what bound it and what it gave up, and plan with that from then on.
 
         Arguments:
-            step: of the frame.
+            step: result of the frame.
             allowed: what :meth:`allow` returned for it.
             views: training cameras, an iteration for each of which is an epoch.
             log: its log. A method that has made iterations, or has logged its own use as ``budget``, is described by

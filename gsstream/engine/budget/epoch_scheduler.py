@@ -32,7 +32,7 @@ class EpochScheduler:
     every pass. It measures by itself: a piece of a pass lasts until the next piece is asked for.
 
     Arguments:
-        budget: of the frame.
+        budget: budget of the frame.
         views: training cameras.
         candidates: how many Gaussians take part.
         epoch_scale: share of the passes that the frame is worth, and of the time that they have.

@@ -25,7 +25,7 @@ class TrainingViews:
     """What the training cameras recorded of a frame, and how they would record a scene.
 
     Arguments:
-        renderer: of the run.
+        renderer: renderer of the run.
         frame: training images.
         exposure: colour maps of the cameras, or None.
         background: colour behind the scene.

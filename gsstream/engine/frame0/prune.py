@@ -40,7 +40,7 @@ def removal_errors(
     Arguments:
         views: training images.
         gaussians: [N] raw values.
-        generator: of the random signs.
+        generator: random generator of the signs.
         probes: images of random signs for each camera, at least 1; the estimate is their mean.
     """
     rows = replace(gaussians, opacities=gaussians.opacities.clamp(max=MAX_LOGIT))

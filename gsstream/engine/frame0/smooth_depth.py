@@ -27,9 +27,9 @@ class SmoothDepth:
     """The smoothness of depth in the views of a frame. Depth is drawn at half size, which is all that it needs.
 
     Arguments:
-        renderer: of the run.
+        renderer: renderer of the run.
         frame: training images, at the size at which they are fitted.
-        device: of the Gaussians.
+        device: device of the Gaussians.
     """
 
     def __init__(self, renderer: Renderer, frame: Frame, device: torch.device) -> None:

@@ -45,7 +45,7 @@ def fit_added(
         work: the frame.
         views: training cameras to fit to.
         epochs: passes over them.
-        rng: of the order of views.
+        rng: random streams; decides the order of views.
     """
     inner = work.on(concat_gaussians(scene, added))
     inner.narrow(torch.arange(len(scene), len(scene) + len(added), device=added.means.device))

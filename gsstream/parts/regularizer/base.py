@@ -38,8 +38,8 @@ class AnalyticPenalty:
     p_i is the open probability of the row's node, r_i its position residual in cells.
 
     Arguments:
-        open_weight: of a row behind an open gate.
-        displacement_weight: of its squared position residual, per cell^2.
+        open_weight: weight of a row behind an open gate.
+        displacement_weight: weight of its squared position residual, per cell^2.
         mean: divide the sum by the number of Gaussians of the scene.
     """
 
@@ -55,7 +55,7 @@ class AnalyticPenalty:
         Arguments:
             open_probability: [M] probability that each node's gate is not zero.
             residual: [A, 3] ungated position residual, cells.
-            hierarchy: of the A rows.
+            hierarchy: groups of the A rows.
             num_gaussians: N, the divisor of a mean.
         """
         divisor = max(num_gaussians, 1) if self.mean else 1

@@ -107,9 +107,9 @@ class StreamingMethod(Part, Generic[State]):
         """Do the work of a later frame that its packet need not wait for, and return the step with the state after it.
 
         The engine calls it once after every ``step``, when the packet has been handed out: live viewers do not wait for
-        this work. The next frame begins after it. Packet, status and ``state.player`` stay as
-        they are; the engine compares. What it changes in the state ``resume`` makes, too. By default there is no such
-        work. A frame whose ``epoch_scale`` is 0 must not fail here either.
+        this work. The next frame begins after it. Packet, status and ``state.player`` stay as they are; the engine
+        compares. ``resume`` must make the changes of this work to the state, too. By default there is no such work. A
+        frame whose ``epoch_scale`` is 0 must not fail here either.
 
         Arguments:
             state: before the frame, as ``step`` was given it.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class FrameBudget:
-    """What one frame may cost, and with what it is made to stay inside. Without a limit: the recipe's own numbers.
+    """The limits of one frame, and the settings that keep it inside them. Without a limit: the recipe's own numbers.
 
     A packet beyond ``max_bytes`` is sent and counted as a violation.
 

@@ -36,7 +36,7 @@ class Case:
     Arguments:
         name: name of the case.
         path: file of its stream.
-        features: what it needs of a decoder, the one it is there for first.
+        features: abilities that a decoder needs for the case; the one that the case tests comes first.
         rules: identifiers of docs/spec that it tests.
         frames: the lines that a decoder prints, one for each frame that can be played.
         refused: whether the stream is refused after these frames.

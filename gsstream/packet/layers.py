@@ -46,7 +46,7 @@ ORDER = ("layers", *_VISIBLE, "layout", "rest")
 
 
 class FirstLayer(NamedTuple):
-    """What can be drawn of a frame's key packet of which the rest has not come: rows in the order of the scene."""
+    """The part of a key packet that can be drawn before the rest has arrived: rows in the order of the scene."""
 
     gaussians: Gaussians[FloatArray]
     meta: StreamMeta

@@ -190,7 +190,7 @@ _STRUCTURE = re.compile(rb'"[^"\\]*(?:\\.[^"\\]*)*"?|[\[\]{}]', re.DOTALL)
 
 
 def _check_encoder_s_own(meta: StreamMeta) -> None:
-    """What encoders leave for those that go on from this scene: a grid's origin and colour maps."""
+    """Values that an encoder leaves for one that goes on from this scene: the origin of its grid and colour maps."""
     extra = meta.extra
     if "origin" in extra:
         _array("extra.origin", extra["origin"], (3,))

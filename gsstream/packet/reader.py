@@ -41,9 +41,9 @@ class StreamReader:
 
     Several threads may :meth:`read` at the same time; :meth:`refresh` and :meth:`close` are of one thread alone.
 
-    ``entries`` lists the complete packets in file order. What stops the walk is kept, not raised, so that the frames
-    before it can be played: ``unfinished`` for a packet cut short at the end of the file, ``damage`` (a PacketError
-    with its byte offset) for anything else. :meth:`check` raises it.
+    ``entries`` lists the complete packets in file order. A damage that stops the walk is kept, not raised, so that the
+    frames before it can be played: ``unfinished`` for a packet cut short at the end of the file, ``damage`` (a
+    PacketError with its byte offset) for anything else. :meth:`check` raises it.
 
     Raises PacketError when the file header is not that of a readable stream, SourceError when there is no file.
     """

@@ -22,8 +22,8 @@ def camera_path(kind: str, rig: Cameras, number: int, region: Region | None = No
     Arguments:
         kind: a name of PATHS.
         rig: cameras of the stream.
-        number: of cameras, at least 1.
-        region: what an orbit stays in; None: that of the rig.
+        number: number of cameras, at least 1.
+        region: region that an orbit stays in; None: that of the rig.
     """
     if kind not in PATHS:
         raise ShapeError(f"no camera path {kind!r}; known: {', '.join(PATHS)}")
@@ -36,7 +36,7 @@ def orbit(rig: Cameras, number: int, region: Region) -> Cameras:
     """Return a path around the focus of a region at the rig's mean distance and height, starting at its first camera.
 
     Where cameras stand all around, one full turn; else a swing over the arc that they span and back, because nothing
-    was recorded of the other side. Where they look outward, so does the path.
+    was recorded of the other side. Where the cameras look outward, those of the path do, too.
     """
     arms = region.arms(rig)
     azimuth, elevation = region.angles(arms)

@@ -33,7 +33,7 @@ Bytes = np.ndarray[Any, np.dtype[np.uint8]]
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """What was written: ``path`` (a file, or a folder of PNGs) with ``frames`` pictures."""
+    """The file, or folder of PNGs, that was written, with ``frames`` pictures."""
 
     path: Path
     frames: int

@@ -91,8 +91,8 @@ class Playback:
         Arguments:
             start, stop: frames ``start`` to ``stop`` - 1 are wanted; default: from the first, to the last.
 
-        Returns the wanted frames before the first damaged packet, and that damage; None where there is none. What the
-        file loses after the damage counts as wanted where ``stop`` is not given. Warns (TruncatedStreamWarning) when
+        Returns the wanted frames before the first damaged packet, and that damage; None where there is none. Where
+        ``stop`` is not given, frames that are lost behind a damage count as wanted. Warns (TruncatedStreamWarning) when
         the last packet is not complete and the frames up to the last are wanted.
 
         Raises InputError for frames that are not in the stream, the damage when it leaves no frame to play.

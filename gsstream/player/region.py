@@ -1,4 +1,4 @@
-"""The region that a rig has recorded: how far a viewer may turn, tilt and go before nothing is known.
+"""The region that a rig has recorded: how far a viewer may turn, tilt and go before he sees what no camera saw.
 
 The page has the same rule (gsstream/web/region.js), and tests/web/test_region.py compares their limits.
 """

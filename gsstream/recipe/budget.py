@@ -38,7 +38,7 @@ def _packet(value: Any) -> Any:
 
 
 def _text(units: dict[str, float]) -> Any:
-    """What a schema knows of the text: number and unit."""
+    """The pattern of the text for a schema: number and unit."""
     return Annotated[str, Field(pattern=rf"^\s*\+?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?\s*({'|'.join(units)})?\s*$")]
 
 

@@ -162,7 +162,7 @@ async def _refuse(websocket: WebSocket, status: int, why: str) -> None:
 
 
 def _after(websocket: WebSocket) -> tuple[int, bytes] | None:
-    """What a viewer that comes again says it has: ``after=FRAME&packet=HEX``; None when that is nothing readable."""
+    """The packet that a returning viewer says it has, ``after=FRAME&packet=HEX``; None when the address holds none."""
     given = websocket.query_params
     try:
         return int(given["after"][:12]), bytes.fromhex(given["packet"][:64])

@@ -29,9 +29,9 @@ class State(NamedTuple):
 class Follower:
     """The packets of a stream file as they are completed.
 
-    ``generation`` rises whenever another stream begins in the file (it was replaced, or cut and written anew): what was
-    read before then no longer leads to what follows. ``entries`` are the frames' packets of this generation, ``keys``
-    the places of key packets in them. A packet that is only half written is not listed until it is whole.
+    ``generation`` rises whenever another stream begins in the file (it was replaced, or cut and written anew): packets
+    that were read before do not lead to those that follow. ``entries`` are the frames' packets of this generation,
+    ``keys`` the places of key packets in them. A packet that is only half written is not listed until it is whole.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:

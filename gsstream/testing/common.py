@@ -99,7 +99,7 @@ def check_citation(part: Part) -> None:
 
 @check("common", kinds=ALL)
 def check_denials(part: Part) -> None:
-    """What the part denies are checks that are made on its kind, each with a reason of at least 20 characters."""
+    """The part denies only checks that are made on its kind, each with a reason of at least 20 characters."""
     made = {entry.name for entry in checks_for(kind_of(part))}
     for name, reason in part.denials().items():
         assert name in made, f"denied: no check named {name!r} is made on a {kind_of(part)}"

@@ -21,7 +21,7 @@ def _proposed(part: Growth, *, changed: bool = True) -> RowEdit | None:
 
 @check("growth")
 def check_growth_fits(part: Growth) -> None:
-    """What is proposed can be written and applied: rows that exist leave, those that join have a node and a unit."""
+    """A proposal can be written and applied: rows that leave exist, rows that join have a node and a unit."""
     scene, rows = fit_fixture().scene, _proposed(part)
     if rows is None:
         return

@@ -129,8 +129,8 @@ def parametrize_with_checks(
     """Decorate ``def test_contract(check): check()`` to make every check on every part, one test each.
 
     A check of a claim that a part does not make is no test; one that cannot be made here is a skipped test with its
-    reason; an expected failure is an xfail, strictly. What the parts themselves deny (``Part.denied``) is expected;
-    ``expected_failures`` (check -> reason) adds to it for all of them.
+    reason; an expected failure is an xfail, strictly. Failures of checks that a part denies (``Part.denied``) are
+    expected; ``expected_failures`` (check -> reason) adds to it for all of them.
     """
     import pytest
 

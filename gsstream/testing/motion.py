@@ -32,7 +32,7 @@ def _proposed(part: MotionPart, *, changed: bool = True) -> tuple[Motion | Field
 
 @check("motion")
 def check_motion_fits(part: MotionPart) -> None:
-    """What is proposed fits the scene, leads to finite values, and is the same motion when a player has read it."""
+    """A proposal fits the scene, leads to finite values, and is the same motion after it was encoded and decoded."""
     scene = fit_fixture().scene
     sent = Delta(tuple(motion for motion in _proposed(part) if not motion.is_empty))
     if sent.is_empty:
@@ -48,7 +48,7 @@ def check_motion_fits(part: MotionPart) -> None:
 
 @check("motion")
 def check_motion_follow(part: MotionPart) -> None:
-    """What is remembered follows from the packets: the same again, also after a part was made anew; nothing is changed.
+    """The memory of a part follows from the packets: a part made anew remembers the same, and no argument is changed.
 
     A frame is proposed from what is remembered, after rows have left as well.
     """
@@ -94,7 +94,7 @@ def check_motion_leaves_unchanged(part: MotionPart) -> None:
 
 @check("motion", trait="finds_motion")
 def check_motion_finds_bodies(part: MotionPart) -> None:
-    """Of two bodies that move by a pixel or two, each its own way, each is found: most of its way is made."""
+    """Two bodies that move by a pixel or two in different directions are both found: most of each motion is made."""
     before, wanted = two_bodies(), shifted((1.2, -0.6, 0.3), (-0.8, 1.0, -0.3))
     missed = after_motion(part, before, wanted) - before.gaussians.means - wanted
     for name, rows in (("first", ONE), ("second", TWO)):
@@ -104,7 +104,7 @@ def check_motion_finds_bodies(part: MotionPart) -> None:
 
 @check("motion", trait="momentum")
 def check_motion_momentum(part: MotionPart) -> None:
-    """Where the images say nothing of a body, it moves by the claimed share of its last displacement."""
+    """A body of which the images show no gradient moves by the claimed share of its last displacement."""
     share, last = part.claims().momentum, shifted((1.5, 0.8, 0), (-1.0, 0.7, 0))
     assert share is not None
     before = invisible(two_bodies(), last)

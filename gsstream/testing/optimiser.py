@@ -32,7 +32,7 @@ def _tables() -> dict[str, torch.Tensor]:
 
 
 def _gradients(step: int) -> dict[str, torch.Tensor]:
-    """Of very different sizes from step to step; every third row of a table has none."""
+    """Gradients of very different sizes from step to step; every third row of a table has none."""
     g = torch.Generator().manual_seed(100 + step)
     found = {name: 10.0 ** (step % 7 - 5) * torch.randn(value.shape, generator=g) for name, value in _tables().items()}
     found["shN"][step % 3 :: 3] = 0

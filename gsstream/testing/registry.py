@@ -22,7 +22,7 @@ CheckFunction = TypeVar("CheckFunction", bound=Callable[..., None])
 
 
 class Advice(Exception):
-    """What a part should have and works without: a warning, not a failure."""
+    """Raised for a property that a part should have and works without: a warning, not a failure."""
 
 
 @dataclass(frozen=True, slots=True)

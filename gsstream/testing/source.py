@@ -97,7 +97,7 @@ def check_source_repeatable(subject: SourceUnderTest) -> None:
 
 @check("source")
 def check_source_own_images(subject: SourceUnderTest) -> None:
-    """What was returned belongs to who asked: changing it changes no later reading."""
+    """A returned array belongs to the caller: changing it changes no later reading."""
     with subject.open() as source:
         first = source.frame(0)
         kept = first.images.copy()
@@ -209,7 +209,7 @@ def check_source_stored_images(subject: SourceUnderTest) -> None:
 
 @check("source")
 def check_source_wrapped(subject: SourceUnderTest) -> None:
-    """Under every split and in a run's coordinates it answers as it does as it is opened."""
+    """A wrapped source answers as the source itself does, under every split and in a run's coordinates."""
     own = {name for name in vars(Source) if not name.startswith("_")}
     assert not own - set(vars(Wrapped)), f"Wrapped does not forward {', '.join(sorted(own - set(vars(Wrapped))))}"
     with subject.open() as opened:

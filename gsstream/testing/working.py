@@ -29,7 +29,7 @@ INDEX = 7
 
 
 class FitFixture(NamedTuple):
-    """What a part is given: the decoded scene, the frame it works on, random streams."""
+    """Arguments of a part: the decoded scene, the frame that it works on, random streams."""
 
     scene: Scene
     work: EngineContext

@@ -13,8 +13,8 @@ from gsstream.core.processors import processors
 
 @contextmanager
 def one_thread_each(workers: int = 0) -> Iterator[ThreadPoolExecutor]:
-    """Give a pool in which torch runs on one thread, and so outside of it: a second one inside a small operation costs
-    more than it brings. 0 workers: one for each processor.
+    """Give a pool of threads, and let torch run on one thread inside and outside of it: a second thread within a small
+    operation costs more time than it saves. 0 workers: one for each processor.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -24,7 +24,7 @@ class KeyPoints(NamedTuple):
 
 
 class Field(NamedTuple):
-    """What becomes of A Gaussians: ``shift`` [A, 3] of their centres, ``turn`` [A, 3] axis * tan(angle / 2)."""
+    """Motion of A Gaussians: ``shift`` [A, 3] of their centres, ``turn`` [A, 3] axis * tan(angle / 2)."""
 
     shift: torch.Tensor
     turn: torch.Tensor

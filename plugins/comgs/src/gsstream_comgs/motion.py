@@ -44,7 +44,7 @@ def gradient_difference(work: FitContext) -> torch.Tensor:
 class KeyPointMotion(MotionPart):
     """Moves Gaussians by a few key points, each with a rigid motion and an ellipsoid (ComGS, NeurIPS 2025).
 
-    What is sent are the rigid motions of small cells that come nearest to the field of the key points.
+    The packet holds the rigid motions of small cells that come nearest to the field of the key points.
     """
 
     source = "ComGS (NeurIPS 2025)"

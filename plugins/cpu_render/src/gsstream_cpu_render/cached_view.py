@@ -67,7 +67,7 @@ class CachedView:
         return LossAndGrad(torch.tensor(loss, dtype=torch.float64), grad)
 
     def comparison(self, target: ViewTarget) -> Any:
-        """What renders of this view are compared with, as the kernels take it."""
+        """The target that renders of this view are compared with, as the kernels take it."""
         return self.rasterizer.comparison(*self._compared(target))
 
     def _compared(self, target: ViewTarget) -> tuple[Any, PreparedImage, float, list[Any], Any]:

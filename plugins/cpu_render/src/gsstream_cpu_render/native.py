@@ -110,7 +110,7 @@ class NativeRasterizer:
         colours: Sequence[Float32 | None],
         weights: Float32 | None,
     ) -> Any:
-        """What renders are compared with, as the one handle that the kernels take.
+        """The target that renders are compared with, as the one handle that the kernels take.
 
         Raises:
             InputError: arrays of another shape.

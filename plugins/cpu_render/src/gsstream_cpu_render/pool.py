@@ -24,7 +24,7 @@ _idle: list[Any] = []
 
 
 class Rig(Protocol):
-    """What is needed of gsstream's Cameras."""
+    """The attributes of gsstream's Cameras that are needed."""
 
     @property
     def viewmats(self) -> NDArray[np.floating[Any]]: ...
@@ -53,7 +53,7 @@ class Passes(ABC):
 class PooledRasterizer:
     """A rasteriser for one owner; its memory returns to the pool when the last reference to the lease goes.
 
-    With ``own`` it came from the system and goes back there.
+    With ``own`` its memory came from the system and goes back there.
     """
 
     def __init__(self, rasterizer: NumpyRasterizer, own: bool) -> None:

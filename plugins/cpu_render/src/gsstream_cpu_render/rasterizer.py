@@ -120,7 +120,8 @@ class NumpyRasterizer(NativeRasterizer):
     def touched_tiles(self) -> NDArray[np.bool_]:
         """[ceil(H / 16), ceil(W / 16)] bool: the tiles that the last active pass rendered.
 
-        With ``touched_only``: where active rows are now or were when cached; nothing else differs from the cache.
+        With ``touched_only`` only pixels are written that active rows touch, or touched when they were cached; all
+        others equal the cache.
 
         Raises:
             InputError: no active pass yet.
@@ -207,7 +208,8 @@ class NumpyRasterizer(NativeRasterizer):
         return v_means2d, visible.view(np.bool_)
 
     def backward_cached_rows(self, splats: SplatArrays, v_image: Float32) -> tuple[NDArray[np.int64], Float32]:
-        """What `backward_cached` gives of the rows that ``v_image`` reaches: [K] ascending and [K, 2], the same bits.
+        """The rows that ``v_image`` reaches, [K] ascending, and their gradients [K, 2], with the bits of
+        `backward_cached`.
 
         All other rows have a gradient of zero. Work and memory do not grow with the number of rows of the scene, but
         for one bit of each.

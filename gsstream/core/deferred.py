@@ -13,7 +13,7 @@ from functools import reduce
 from operator import and_
 from typing import Any
 
-#: Makes an error, which says what is wrong, into the one that is raised, which also says whose fault it is.
+#: Function from an error that says what is wrong to the error that is raised, which also names the part at fault.
 Blame = Callable[[Exception], Exception]
 Check = tuple[Any, Callable[[], Exception], Blame]
 _PENDING: ContextVar[list[Check] | None] = ContextVar("pending", default=None)

@@ -16,7 +16,7 @@ Tell = Callable[[str, int, int], None]
 #: Seconds after which a line is printed though nothing has changed. With the time that it takes to wake up, no more
 #: than five seconds lie between two lines.
 EVERY = 4.0
-#: Seconds after which the pace of a work counts as known.
+#: Seconds of work after which its pace counts as known.
 PACE = 2.0
 
 

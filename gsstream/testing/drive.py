@@ -26,7 +26,7 @@ class Poison:
     what: str  # it is, for the message
     named: str  # what a refusal of it must name
     put: Callable[[World, float], None]  # a value into a world
-    #: Two values that it may have; where they make no difference to a part, it is not read.
+    #: Two values that the field may have; a part to which they make no difference does not read the field.
     usual: tuple[float, float] = (0.75, 0.25)
 
 

@@ -25,7 +25,8 @@ from gsstream.input.seeds.geometry import neighbour_views
 REACH = 0.3
 #: Cameras that each camera is compared with.
 PARTNERS = 12
-#: Least correlation with the others, and least fall of it away from the best offset, with which a clock is known.
+#: A clock counts as known from this correlation with the other cameras on, if the correlation falls by at least the
+#: second number away from the best offset.
 ALIKE, FALL = 0.3, 0.05
 #: Least offset that is claimed, frames; least gain of correlation by it, and the same times the frames squared (few
 #: frames say little); least share of the partners that agree.

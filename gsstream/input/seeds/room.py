@@ -39,7 +39,8 @@ NOISE, HALF, ENOUGH = 0.02, 3, 500
 CENTER_SPREAD, INSIDE = 0.05, 0.93
 #: Correlations below which another camera contradicts a place on the wall, and above which it confirms the sweep.
 CONTRADICTED, CONFIRMED = 0.2, 0.6
-#: Shares of the room's depth that a surface in front of it is nearer than: a sure one, and one with a single supporter.
+#: A surface counts as in front of the room where its depth is below this share of the room's: one that several views
+#: support, and one with a single supporter.
 IN_FRONT, CLEARLY_IN_FRONT = 0.97, 0.93
 #: Difference of depth up to which another view supports the sweep.
 SUPPORT = 0.03

@@ -71,7 +71,7 @@ def test_a_state_takes_these_calls_and_no_others(state: str, call: str) -> None:
         return
     with pytest.raises(InputError, match=f"{call}: {MESSAGES.get(call, FORWARD)}"):
         CALLS[call](subject)
-    # A refusal changes nothing: what the state takes it still takes.
+    # A refusal changes nothing: the calls that the state takes still succeed.
     for other in sorted(taken - {"forward", "update", "freeze", "forget", "free_scratch", "forward_cached"}):
         CALLS[other](subject)
 

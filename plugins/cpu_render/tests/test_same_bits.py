@@ -39,7 +39,7 @@ def rasterised() -> list[Any]:
 
 
 def whole_scene() -> list[Any]:
-    """Twice, with a smaller scene in between."""
+    """A scene is worked on twice, with a smaller one in between."""
 
     def fused(rows: Gaussians[torch.Tensor], coloured: bool) -> list[torch.Tensor]:
         session = CpuRenderer().open(rows, None, rig(), BACKGROUND)

@@ -231,7 +231,7 @@ class Scripted:
 
 @st.composite
 def steps(draw: st.DrawFn) -> list[Step]:
-    """A forest in any order: what is waited for may stand later in the list."""
+    """A forest of jobs in any order: a job that others wait for may stand later in the list."""
     number = draw(st.integers(0, 8))
     needs = [draw(st.none() | st.integers(0, k - 1)) if k else None for k in range(number)]
     deaths = st.integers(0, RETRIES + 1)

@@ -70,7 +70,7 @@ def test_a_killed_sweep_goes_on_without_repeating_a_cell(tmp_path):
 
 
 def _check_cells(table, out: Path) -> None:
-    """What stands in the table is what lies in the streams."""
+    """The numbers of the table are those of the streams."""
     for key, row in table.cells.items():
         with Playback(out / "cells" / f"{key}.gss") as playback:
             assert [frame["frame"] for frame in row["frames"]] == list(playback.frames) == [0, 1]

@@ -78,7 +78,7 @@ def test_levels_say_the_past_together_and_new_anchors_inherit_it() -> None:
 
 
 def test_the_weight_of_motion_keeps_what_the_images_say_nothing_about() -> None:
-    """Where the images hold the Gaussians moved, as far as momentum moves them, only the weight takes them back."""
+    """The images show the Gaussians where momentum moves them, so only the weight of the penalty moves them back."""
     means = RNG.normal((0, 0, 3), 0.05, (60, 3))
     shift = np.tile(np.float32([0.05, 0, 0]), (60, 1))
     scene = scene_at(means, Displacement(np.arange(60), shift, np.zeros_like(shift)))

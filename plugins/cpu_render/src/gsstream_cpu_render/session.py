@@ -254,5 +254,5 @@ class _ActivePass(Passes):
 
     def backward(self, splats: SplatArrays, v_image: Float32, v_alpha: Float32 | None) -> tuple[Float32, ...]:
         if self._view.rasterizer.passes != self._pass:
-            self.forward(splats)  # the view was rendered again since; the same inputs give the same bits
+            self.forward(splats)  # the view was rendered again; the same inputs give the same bits
         return self._view.rasterizer.backward_active(v_image, v_alpha)

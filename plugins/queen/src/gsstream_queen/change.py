@@ -11,7 +11,7 @@ from gsstream.backend import Renderer
 from gsstream.blocks import count_per_tile
 from gsstream_queen.settings import ChangeSettings
 
-#: A pixel changed where dynamic Gaussians alone reach this alpha.
+#: A pixel counts as changed where a render of the dynamic Gaussians alone reaches this alpha.
 ALPHA = 0.5
 #: Changed pixels that make a tile of 16 x 16 a changed one.
 PIXELS = 40

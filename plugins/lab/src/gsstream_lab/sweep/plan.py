@@ -182,7 +182,7 @@ def _resolve(
 
 
 def _recorded(scene: Scene, variant: Variant, seed: int) -> Scene:
-    """The scene as a variant sees it."""
+    """The scene with the changes that a variant makes to it."""
     uri = disturbed_uri(scene.uri, variant.disturbed, seed)
     return scene if uri == scene.uri else scene.model_copy(update={"uri": uri})
 

@@ -59,7 +59,7 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """How a decoder did at a case: ``problem`` is None where it did as it should, or left the case out as it may."""
+    """Result of a decoder at a case: ``problem`` is None where it was right, or left out what it may leave out."""
 
     case: Case
     problem: str | None = None

@@ -33,7 +33,7 @@ _COMMENTS = re.compile(rb"^[ \t]*(?://[^\n]*|/\*\*.*?\*/)\n", re.MULTILINE | re.
 
 
 class Package(NamedTuple):
-    """What was written: the folder, segments and joins (of all renditions), and the bytes of each and of the player."""
+    """A written package: folder, segments and joins (of all renditions), and the bytes of each and of the player."""
 
     folder: Path
     segments: int

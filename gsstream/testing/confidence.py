@@ -67,7 +67,7 @@ def check_confidence_view_order(part: ConfidenceEstimator) -> None:
 
 @check("confidence", trait="finds_motion")
 def check_confidence_finds_motion(part: ConfidenceEstimator) -> None:
-    """What moved outranks what did not: area under the ROC curve at least 0.9. A check of usefulness."""
+    """Gaussians that moved outrank those that did not: area under the ROC curve at least 0.9. A check of usefulness."""
     case = get_case("moving")
     got = part.estimate(case)
     moved, still = got[case.moving_mask], got[~case.moving_mask]

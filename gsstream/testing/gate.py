@@ -163,7 +163,7 @@ def check_gate_clamp(part: GateSampler) -> None:
 
 @check("gate")
 def check_gate_state_resume(part: GateSampler) -> None:
-    """The logits are all there is: one plain float32 tensor per node, and a copy of it gives the same gates."""
+    """A gate has no state but its logits, a float32 tensor with one per node: a copy of it gives the same gates."""
     start = get_case("cloud").logits
     logits = part.init(start)
     assert type(logits) is torch.Tensor, f"init(): expected a plain torch.Tensor, got {type(logits).__name__}"

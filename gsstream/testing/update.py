@@ -61,7 +61,7 @@ def check_update_decoders(part: UpdateRule) -> None:
 
 @check("update")
 def check_update_closed_loop(part: UpdateRule) -> None:
-    """What training renders is what a player computes from the integers, to the last bits of float32."""
+    """Training renders the rows that a player computes from the integers, to the last bits of float32."""
     case = get_case("cloud")
     before = fingerprint(case.gaussians)
     n = len(case.gaussians)

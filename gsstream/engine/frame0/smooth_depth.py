@@ -66,7 +66,7 @@ class SmoothDepth:
         return torch.stack(terms).sum() if terms else blended.new_zeros(())
 
     def _edge_weights(self, view: int) -> list[torch.Tensor]:
-        """What a change of depth along both axes costs from pixel to pixel: less where the image changes, too."""
+        """Cost of the change of depth between neighbouring pixels; it is lower where the image changes, too."""
         if view not in self._edges:
             image = torch.from_numpy(self._frame.image(view)).permute(2, 0, 1)
             half = adaptive_avg_pool2d(image, (self._cameras.height, self._cameras.width))

@@ -1,4 +1,4 @@
-"""A run whose frame 0 shows nothing: all that follows grows from nothing, and that is said when there is something."""
+"""A warning where frame 0 shows nothing, given when something appears, which then has to grow from nothing."""
 
 from __future__ import annotations
 

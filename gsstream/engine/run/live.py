@@ -42,7 +42,7 @@ def live_metrics(frame: Frame, written: float) -> dict[str, Any] | None:
 
 
 def _policy(frame: Frame) -> str | None:
-    """What was done to a frame: its weightiest name; a frame that is dropped is neither hurried nor held."""
+    """Name of the most drastic policy for a frame: one that is dropped is neither hurried nor held."""
     if frame.index == 0:
         return None  # always done in full, of every camera
     absent = bool(frame.arrival and frame.arrival.absent)

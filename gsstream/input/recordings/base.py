@@ -122,7 +122,7 @@ class Source(ABC):
         return None if set(cameras) & set(self.info.train.ids) else self.points(kind)
 
     def moment(self, index: int) -> Moment:
-        """Return what there is to say of an instant; a recording that is still being written waits for it."""
+        """Return what is known of an instant; a recording that is still being written waits for it."""
         return Moment()
 
     def epoch_scale(self, index: int) -> float:

@@ -83,7 +83,7 @@ class WatchSource(Source):
 
     @property
     def info(self) -> SourceInfo:
-        """What is known now: ``num_frames`` is None until it is declared or the end has been seen."""
+        """What is known so far: ``num_frames`` is None until it is declared or the end has been seen."""
         return self._info
 
     def frame(self, index: int, split: Split = "train") -> Frame:
@@ -138,7 +138,7 @@ class WatchSource(Source):
         self.interrupt()
 
     def _arrival(self, index: int, held: Collection[str]) -> Arrival:
-        """How a frame came in; test cameras count as to when, for it was not handed over before they were there."""
+        """How a frame arrived, and when: the frame waits for its test cameras, so they count, too."""
         came = self._newest_of(set(self._ids).difference(held), index)
         return Arrival(came, tuple(name for name in self._info.train.ids if name in held))
 

@@ -94,7 +94,7 @@ def fit_copies(
 
 
 def _copies(work: FitContext, gradient: float, room: int, admitted: CopyFilter | None) -> Gaussians[torch.Tensor]:
-    """Copies of at most ``room`` Gaussians. What is rendered for it, a render for every camera, goes with the call."""
+    """Copies of at most ``room`` Gaussians. Its renders, one for every camera, are released on return."""
     places = high_gradient_rows(work, gradient)
     if admitted is not None:
         places = admitted(work, places)

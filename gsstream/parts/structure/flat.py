@@ -20,7 +20,7 @@ from gsstream.parts.structure.base import Anchors, Structure, StructureTraits
 
 @final
 class Flat(Structure):
-    """No grouping: M = N, every node a root. Anchors are the points themselves."""
+    """No grouping: M = N, and every node is a root. Anchors are the points themselves."""
 
     source = "gsstream"
 

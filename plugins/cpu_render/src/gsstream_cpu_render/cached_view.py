@@ -37,7 +37,7 @@ class CachedView:
 
     @property
     def transmittance(self) -> Float32:
-        """What is left of the light behind everything [H, W]. Native fits never ask; for others it is kept."""
+        """Share of the background's light that is left [H, W]. Native fits never ask; for others it is kept."""
         if self._transmittance is None:
             self._transmittance = self.rasterizer.forward_cached()[1]
         return self._transmittance

@@ -114,24 +114,38 @@ def _cameras(playback: Playback, wanted: str | None) -> list[str | None]:
 
 
 def named_recording(file: Path, meta: StreamMeta, catalog: Catalog) -> str:
-    """Return the recording named in a stream, if a file from a stranger may choose this recording.
+    """Return the recording that a stream was made from, if a file from a stranger may choose this recording.
 
-    Folders, the demo and synthetic scenes are read as they are. What waits (watch:) or is opened by a plugin is only
-    opened when the user names it. Raises InputError.
+    A stream says which recording that was and, but for the demo and synthetic scenes, not where it lies: this stands in
+    recording.txt of the run's folder. What waits (watch:) or is opened by a plugin is only opened when the user names
+    it. Raises InputError.
     """
-    uri = str(meta.extra.get("source_uri", ""))
-    if not uri:
-        raise InputError(f"{file} does not say which recording it was made from; name it with --source")
-    if uri.startswith("rig:"):
+    from gsstream.input.recordings.origin import RECORDING, public_uri, read_recording
+
+    said = str(meta.extra.get("source_uri", ""))
+    if said == "demo" or said.startswith("synthetic:"):
+        return said
+    if said.startswith("rig:"):
         raise InputError(f"{file} was made from images that Python gave; name a recording of them with --source")
-    for scheme in uri.split(":")[:-1]:
+    beside = read_recording(file)
+    if beside is None:
+        raise InputError(
+            f"{file} was made from the recording {said[:200]!r} and does not say where that lies, which only "
+            f"{RECORDING} in the folder of a run does; name it with --source"
+        )
+    for scheme in beside.split(":")[:-1]:
         entry = catalog.entries.get(("source", scheme))
         if scheme == "watch" or (entry is not None and entry.plugin != "builtin"):
             raise InputError(
-                f"{file} says that it was made from {uri[:200]!r}, which is not opened because a file says so; if you "
-                "trust it, name it yourself with --source"
+                f"{file} was made from {beside[:200]!r}, by {RECORDING} beside it, which is not opened because a file "
+                "says so; if you trust it, name it yourself with --source"
             )
-    return uri
+    if public_uri(beside) != said:
+        raise InputError(
+            f"{file} was made from the recording {said[:200]!r}, but {RECORDING} beside it names {beside[:200]!r}; "
+            "name the right one with --source"
+        )
+    return beside
 
 
 def check_recipe(file: Path, recipe: Mapping[str, Any]) -> None:

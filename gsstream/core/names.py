@@ -1,10 +1,12 @@
-"""Names that become file names: which ids a camera may have, and how a name is joined to a folder."""
+"""Names and places: which ids may be file names, how a name is joined to a folder, and what of a path is a name."""
 
 from __future__ import annotations
 
+import re
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from gsstream.core.errors import OutputError, ShapeError
 
@@ -57,3 +59,20 @@ def child(folder: Path, name: str) -> Path:
     if (fault := name_fault(name)) is not None:
         raise OutputError(f"cannot write {name[:60]!r} into {folder}: {fault}")
     return folder / name
+
+
+def last_part(text: str) -> str:
+    """Return the name in a path or an address: no folder, no machine, no user, no password, no query is left of it."""
+    _, is_address, rest = text.partition("://")
+    if is_address:
+        text = re.split(r"[?#]", rest)[0].rpartition("@")[2]
+    return re.split(r"[/\\]", text.rstrip("/\\"))[-1]
+
+
+def without_places(value: Any) -> Any:
+    """Return plain JSON values in which every text that is a path or an address is only its last part."""
+    if isinstance(value, Mapping):
+        return {key: without_places(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_places(inner) for inner in value]
+    return last_part(value) if isinstance(value, str) and re.search(r"[/\\]", value) else value

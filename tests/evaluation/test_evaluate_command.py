@@ -10,6 +10,7 @@ from test_player import ARC, look_at
 
 from gsstream.cli.main import run_command
 from gsstream.core.changes import Layout
+from gsstream.input.recordings.origin import public_uri
 from gsstream.packet import KeyState, StreamMeta, StreamWriter, encode_key
 from tests.scenes import make_scene
 
@@ -34,10 +35,29 @@ def test_a_stream_whose_recipe_is_empty_is_compared_like_others(tmp_path, capsys
 @pytest.mark.parametrize(
     "uri", ["watch:DIR?timeout=86400", "disturbed:gain=2:watch:DIR", "watch:", "disturbed::watch:x"]
 )
-def test_a_stream_cannot_make_it_wait(uri, tmp_path, capsys) -> None:
-    path = hostile_stream(tmp_path / "s.gss", extra={"source_uri": uri.replace("DIR", str(tmp_path))})
+def test_a_file_of_a_run_cannot_make_it_wait(uri, tmp_path, capsys) -> None:
+    path = hostile_stream(tmp_path / "stream.gss", extra={"source_uri": uri})
+    (tmp_path / "recording.txt").write_text(uri.replace("DIR", str(tmp_path)))
     assert run_command(["evaluate", str(path)]) == 2
     assert "name it yourself with --source" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["evaluate", "left-behind"])
+@pytest.mark.parametrize("said", ["a-folder", "folder:a-folder", "disturbed:", "", "/whole/path/of/before"])
+def test_a_stream_alone_does_not_say_where_its_recording_lies(command, said, tmp_path, capsys) -> None:
+    path = hostile_stream(tmp_path / "s.gss", extra={"source_uri": said})
+    (tmp_path / "recording.txt").write_text("/whole/path/of/before\n")  # of another stream: this one is not stream.gss
+    assert run_command([command, str(path)]) == 2
+    err = capsys.readouterr().err
+    assert f"was made from the recording {said!r} and does not say where that lies" in err
+    assert "name it with --source" in err
+
+
+def test_a_run_s_folder_that_names_another_recording_is_refused(tmp_path, capsys) -> None:
+    path = hostile_stream(tmp_path / "stream.gss", extra={"source_uri": "mine"})
+    (tmp_path / "recording.txt").write_text("/data/yours\n")
+    assert run_command(["evaluate", str(path)]) == 2
+    assert "recording.txt beside it names '/data/yours'; name the right one" in capsys.readouterr().err
 
 
 RECIPES = {
@@ -56,7 +76,8 @@ def test_recipes_that_no_run_can_have_had_are_refused(key, tmp_path, capsys) -> 
 
 @pytest.mark.parametrize("uri", ["x" * 5000, "folder:" + "y" * 5000, "\0", "a\nb\x1b[2J"])
 def test_names_that_are_no_files_are_refused_in_one_line(uri, tmp_path, capsys) -> None:
-    path = hostile_stream(tmp_path / "s.gss", extra={"source_uri": uri})
+    path = hostile_stream(tmp_path / "stream.gss", extra={"source_uri": public_uri(uri)})
+    (tmp_path / "recording.txt").write_text(uri)
     assert run_command(["evaluate", str(path)]) == 2
     err = capsys.readouterr().err
     assert err.startswith("error: ")

@@ -57,7 +57,7 @@ def test_a_folder_with_another_run_is_left_alone(tmp_path: Path, capsys: pytest.
     encode(tmp_path, "--frames", "1")
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     err = refused(capsys, arguments(tmp_path))
-    assert "already holds a run (stream.gss, metrics.jsonl, recipe.yaml)" in err
+    assert "already holds a run (stream.gss, metrics.jsonl, recipe.yaml, recording.txt)" in err
     assert "--resume" in err
     assert "--overwrite" in err
     # Whatever else is wrong is found before --overwrite deletes anything.

@@ -205,6 +205,7 @@ def test_the_run_folder_is_complete(tmp_path: Path) -> None:
         "stream.gss",
         "metrics.jsonl",
         "recipe.yaml",
+        "recording.txt",
         "contact_sheet.png",
         "frames.png",
         "summary.txt",
@@ -232,7 +233,7 @@ def test_without_pictures_a_run_is_the_same_and_they_can_follow(
             patch.setitem(sys.modules, name, None)  # importing it anywhere fails
         without = encode(out, "--frames", "3", method="s2gs-edge")
     names = {path.name for path in out.iterdir()}
-    assert names == {"stream.gss", "metrics.jsonl", "recipe.yaml", "summary.txt"}
+    assert names == {"stream.gss", "metrics.jsonl", "recipe.yaml", "recording.txt", "summary.txt"}
     recipe = (out / "recipe.yaml").read_bytes()
     assert encode(out, "--frames", "3", "--resume", method="s2gs-edge", pictures=True) == without
     assert {path.name for path in out.iterdir()} == names | pictures

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from gsstream.core.errors import GsstreamError
+from gsstream.core.names import without_places
 from gsstream.discovery.catalog import Catalog
 from gsstream.recipe.load import resolve_recipe
 from gsstream.recipe.model import ComponentRef, Recipe
@@ -89,5 +90,5 @@ def _as_list(value: Any) -> Any:
 
 
 def _short(value: Any) -> str:
-    text = format(value, "g") if isinstance(value, float) else str(value)
+    text = format(value, "g") if isinstance(value, float) else str(without_places(value))
     return text if len(text) <= 24 else f"{text[:21]}..."

@@ -11,6 +11,7 @@ import torch
 
 from gsstream.core.errors import OutputError, PacketError
 from gsstream.core.hierarchy import Hierarchy
+from gsstream.core.names import without_places
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import decoded_anchors, exposure_from_meta, shell_behind
@@ -135,7 +136,7 @@ def rebuild_hierarchy(assembly: Assembly, player: PlayerState) -> Hierarchy:
 
 
 def _check_recipe(assembly: Assembly, meta: StreamMeta) -> None:
-    old, new = dict(meta.recipe), assembly.recipe.model_dump(mode="json")
+    old, new = dict(meta.recipe), without_places(assembly.recipe.model_dump(mode="json"))
     changed = sorted(
         key for key in new if key != "frames" and _deciding_keys(key, old.get(key)) != _deciding_keys(key, new[key])
     )

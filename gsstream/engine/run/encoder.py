@@ -16,6 +16,7 @@ import torch
 from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.log import FrameLog
+from gsstream.core.names import last_part, without_places
 from gsstream.core.rng import Rng
 from gsstream.core.storage import packed
 from gsstream.core.world import snap_cameras
@@ -31,6 +32,7 @@ from gsstream.engine.keys.resume import check_stream, read_end, states_since_key
 from gsstream.engine.run.run_frame import live_method, run_follow_up, run_frame, run_resume
 from gsstream.engine.step.tools import RunTools
 from gsstream.input.recordings.base import SourceInfo
+from gsstream.input.recordings.origin import public_uri
 from gsstream.input.seeds.shell import mean_color
 from gsstream.metrics import peak_memory_mb
 from gsstream.packet import EncodedPacket, PlayerState, StreamMeta
@@ -227,16 +229,17 @@ class Encoder:
         distributions = {"gsstream", *self.assembly.distributions}
         known = {} if self.state is None else self.state.player.meta.extra
         carried = {name: known[name] for name in CARRIED if name in known}
+        origin = {"source_uri": public_uri(info.uri), "licence": info.licence, "title": self.assembly.title}
         return StreamMeta(
             method=recipe.method,
-            source=info.name,
-            recipe=recipe.model_dump(mode="json"),
+            source=last_part(info.name),
+            recipe=without_places(recipe.model_dump(mode="json")),
             train=frame.cameras,
             test=replace(info.test, near_plane=self.near_plane),
             fps=info.fps,
             background=self.assembly.background,
             plugins={name: version(name) for name in sorted(distributions)},
-            extra={"source_uri": info.uri, "licence": info.licence, "title": self.assembly.title, **carried},
+            extra={**origin, **carried},
             world=info.world,
         )
 

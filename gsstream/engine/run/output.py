@@ -17,11 +17,12 @@ from types import FrameType
 from typing import Any
 
 from gsstream.core.errors import OutputError
+from gsstream.input.recordings.origin import RECORDING
 
 #: Held while a run writes into the folder; gone when it does not.
 LOCK = "run.lock"
 #: Files that say "a run lives here", and that a run may replace.
-RUN_FILES = ("stream.gss", "metrics.jsonl", "recipe.yaml")
+RUN_FILES = ("stream.gss", "metrics.jsonl", "recipe.yaml", RECORDING)
 #: Files that are made from a finished run; a new run removes them, lest files of the old run stay behind.
 MADE_FILES = ("contact_sheet.png", "frames.png", "summary.txt", "video.mp4", "gap.txt", "gap.json")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import signal
 import threading
 import time
@@ -25,8 +26,10 @@ from gsstream.engine.run.live import live_metrics
 from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.run.measured_again import measure_again
 from gsstream.engine.run.metrics_log import add_metrics, append_metrics, last_written, trim_metrics
+from gsstream.engine.run.output import write_whole
 from gsstream.engine.run.progress import RunProgress
 from gsstream.input.recordings.base import Source, SourceInfo
+from gsstream.input.recordings.origin import RECORDING, whole_uri
 from gsstream.input.recordings.prefetch import Prefetcher
 from gsstream.packet import EncodedPacket, PlayerState, StreamReader, StreamWriter
 from gsstream.packet.base import FILE_HEADER
@@ -66,7 +69,7 @@ def run(
     first_frame: PlayerState | None = None,
     listener: RunListener | None = None,
 ) -> RunResult:
-    """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml).
+    """Encode a recording into ``out`` (stream.gss, metrics.jsonl, recipe.yaml, recording.txt).
 
     Arguments:
         assembly: the live parts of the recipe.
@@ -132,6 +135,8 @@ class _Run:
     def prepare(self, resume: bool) -> int:
         """Resume the stream in the folder, or write the recipe of a new one; return the first frame to encode."""
         last = self._resume() if resume else None
+        # Also of a run that goes on: the recording may lie elsewhere by then.
+        write_whole(self.out / RECORDING, os.fsencode(whole_uri(self.source.info.uri) + "\n"))
         if last is None:
             # Made before the first packet: without this file, nobody could tell that the line of the packet is missing.
             (self.out / METRICS).touch()

@@ -188,4 +188,5 @@ def test_three_frames(tmp_path: Path, world: World, name: str) -> None:
     with Playback(out / "stream.gss") as playback:
         assert playback.meta.test.ids == (layout.names(0),)
         assert len(playback.meta.train.ids) == 3
-        assert playback.meta.extra["source_uri"] == str(folder)
+        assert playback.meta.extra["source_uri"] == folder.name
+    assert (out / "recording.txt").read_text() == f"{folder}\n"

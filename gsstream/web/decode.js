@@ -1,6 +1,7 @@
 // The state that a stream of packets leads to, bit for bit the one of the encoder. See docs/spec.
 
-import { decodeMotions, unionRows, SECTIONS as MOTION } from "./changes/motion.js";
+import { decodeField, SECTIONS as FIELD } from "./changes/field.js";
+import { copied as motionCopy, decodeMotions, unionRows, SECTIONS as MOTION } from "./changes/motion.js";
 import { applyResidual, decodeResidual, SECTIONS as RESIDUAL } from "./changes/residual.js";
 import { applyRows, decodeRows, SECTIONS as ROWS } from "./changes/rows.js";
 import { KIND, parsePacket } from "./container.js";
@@ -62,17 +63,20 @@ export function firstState(frame, number, { scene, layout, meta, rest }) {
 }
 
 /** Sections of a delta packet in their order. */
-const ORDER = [...MOTION, ...RESIDUAL, ...ROWS];
+const ORDER = [...MOTION, ...FIELD, ...RESIDUAL, ...ROWS];
 
 function decodeDelta(found, state, offset) {
   const { field, motion } = found;
-  if (field) throw new PacketError("a network moves this frame: only gsstream play can show it", field.offset);
   const names = Object.keys(found);
   const places = names.map((name) => ORDER.indexOf(name));
   if (!places.length || places.some((place, i) => place < 0 || place < places[i - 1])) {
     throw new PacketError(`delta packet: sections ${names.join(", ") || "none"} do not stand in this order`, offset);
   }
-  const motions = motion ? located(motion.offset, () => decodeMotions(motion, state)) : null;
+  let motions = motion ? located(motion.offset, () => decodeMotions(motion, state)) : null;
+  if (field) {
+    motions ??= { ...motionCopy(state), groups: state.groups, rows: [] };
+    motions = located(field.offset, () => decodeField(field, motions));
+  }
   const stray = names.find((name) => RESIDUAL.includes(name));
   if (stray && !found.gates) throw new PacketError(`delta packet: section ${stray} without gates`, found[stray].offset);
   const residual = found.gates ? decodeResidual(found, state, offset) : null;

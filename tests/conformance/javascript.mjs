@@ -22,7 +22,6 @@ try {
   walker.finish();
 } catch (error) {
   if (!(error instanceof PacketError)) throw error;
-  const network = error.message.startsWith("a network moves this frame");
-  console.log(network ? "unsupported field" : `refused ${error.message}`);
-  process.exitCode = network ? 3 : 1;
+  console.log(`refused ${error.message}`);
+  process.exitCode = 1;
 }

@@ -40,7 +40,7 @@ export function decodeMotions(section, state) {
 }
 
 /** Copies of the centres and rotations of a state, in its spare memory if there is any, which then is used up. */
-function copied(state) {
+export function copied(state) {
   const { scene, spare } = state;
   // Until a motion is applied as a whole, the content of the spare memory is undefined.
   state.spare = null;
@@ -201,7 +201,7 @@ function transforms({ groups, number, symbols, translationStep, rotationStep, pr
 }
 
 /** Unit quaternions wxyz of rotations given as axis * tan(angle / 2). */
-function rodriguesToQuat(rotation) {
+export function rodriguesToQuat(rotation) {
   const out = new Float64Array((rotation.length / 3) * 4);
   for (let k = 0; 3 * k < rotation.length; k += 1) {
     const [x, y, z] = rotation.subarray(3 * k, 3 * k + 3);
@@ -234,7 +234,7 @@ function transformMean(means, row, quats, centre, translation, k) {
   }
 }
 
-function rotateQuat(values, row, quats, k) {
+export function rotateQuat(values, row, quats, k) {
   const w0 = quats[4 * k];
   const x0 = quats[4 * k + 1];
   const y0 = quats[4 * k + 2];

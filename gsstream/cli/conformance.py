@@ -32,14 +32,15 @@ def conformance(
     Without a program the decoder is that of this package. The exit code is 1 where a stream is not played or not
     refused as it must be.
     """
-    from gsstream.packet.conformance import by_feature, judge, load_cases, play_here, play_with
+    from gsstream.packet.conformance import by_feature, cite, judge, load_cases, play_here, play_with
 
-    cases = load_cases(vectors or SUITE)
-    play = play_here if program is None else play_with(shlex.split(program))
+    suite = vectors or SUITE
+    cases = load_cases(suite)
+    named = play_with(shlex.split(program)) if program is not None else lambda path: cite(suite, play_here(path))
     results: list[Result] = []
     advance = progress_on("stream")
     for case in cases:
-        results.append(judge(case, play(case.path)))
+        results.append(judge(case, named(case.path)))
         if advance is not None:
             advance(len(results), len(cases))
     for result in results:

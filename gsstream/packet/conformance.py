@@ -3,13 +3,14 @@
 A decoder is a program that is called with the path of a stream. It prints a line for each frame, ``INDEX HASH``, then
 ends with exit code 0; or it prints a line ``refused WHY`` and ends with another exit code; or, where it has no fields,
 ``unsupported field``. A line ``without meta`` before all others says that it does not read the meta.
-tests/conformance/README.md is the whole contract.
+The rules that WHY cites are compared. tests/conformance/README.md is the whole contract.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import re
 import subprocess
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ from gsstream.packet.state import PlayerState, decode_packet
 
 #: Seconds that a program may take for one stream; the largest has some hundred kilobytes.
 TIMEOUT = 60
+#: How a decoder cites a rule of docs/spec.
+_RULE = re.compile(r"\bR-\d+(?:\.\d+)?-\d+\b")
 #: What a decoder may leave out (section 0.6 of docs/spec).
 OPTIONAL = frozenset({"field", "meta"})
 
@@ -122,6 +125,19 @@ def _play(reader: StreamReader, lines: list[str]) -> None:
         raise PacketError("the stream holds no complete key packet", reader.end)
 
 
+def cite(folder: Path, outcome: Outcome) -> Outcome:
+    """Return what a decoder printed with the rule behind its refusal, which messages.json of a suite knows.
+
+    Decoders of this repository say what is wrong in words, for who uses them; the suite knows which rule that is.
+    """
+    if not outcome.lines or not outcome.lines[-1].startswith("refused "):
+        return outcome
+    known: list[tuple[str, list[str]]] = json.loads((folder / "messages.json").read_text(encoding="utf-8"))
+    why = re.sub(r" \(at byte \d+\)$", "", outcome.lines[-1])
+    rules = next((rules for words, rules in known if re.search(words, why)), ["R-0.1-1"])
+    return Outcome((*outcome.lines[:-1], f"{outcome.lines[-1]} {' '.join(rules)}"), outcome.code)
+
+
 def play_with(program: Sequence[str]) -> Callable[[Path], Outcome]:
     """Return a decoder that runs a program with the path of a stream behind its own arguments."""
 
@@ -163,6 +179,9 @@ def judge(case: Case, outcome: Outcome) -> Result:
     ended = "refused" if word == "refused" and outcome.code > 0 else f"exit code {outcome.code} after {last[:90]!r}"
     if case.refused and ended != "refused":
         return Result(case, f"expected it to be refused by {' '.join(case.rules)}, got {ended}")
+    cited = set(_RULE.findall(last)) if case.refused else set()
+    if cited and cited.isdisjoint(case.rules):
+        return Result(case, f"expected it to be refused by {' or '.join(case.rules)}, got {' or '.join(sorted(cited))}")
     if not case.refused and (last or outcome.code):
         return Result(case, f"expected it to be played to its end, got {ended}")
     return Result(case)

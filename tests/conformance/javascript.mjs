@@ -22,6 +22,9 @@ try {
   walker.finish();
 } catch (error) {
   if (!(error instanceof PacketError)) throw error;
-  console.log(`refused ${error.message}`);
+  const known = JSON.parse(readFileSync(new URL("messages.json", import.meta.url)));
+  const why = `refused ${error.message}`.replace(/ \(at byte \d+\)$/, "");
+  const [, rules] = known.find(([words]) => new RegExp(words).test(why)) ?? [null, ["R-0.1-1"]];
+  console.log(`refused ${error.message} ${rules.join(" ")}`);
   process.exitCode = 1;
 }

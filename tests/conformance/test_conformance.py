@@ -16,7 +16,7 @@ import pytest
 from gsstream.core.changes import motion
 from gsstream.core.changes import residual as residual_change
 from gsstream.core.errors import InputError
-from gsstream.packet.conformance import Case, Outcome, by_feature, judge, load_cases, play_here, play_with
+from gsstream.packet.conformance import Case, Outcome, by_feature, cite, judge, load_cases, play_here, play_with
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
@@ -34,7 +34,7 @@ def rules() -> set[str]:
 
 
 def test_this_decoder_plays_and_refuses_all_streams() -> None:
-    problems = [result for case in CASES if (result := judge(case, play_here(case.path))).problem]
+    problems = [result for case in CASES if (result := judge(case, cite(HERE, play_here(case.path)))).problem]
     assert problems == []
 
 
@@ -49,7 +49,7 @@ def test_the_browsers_decoder_plays_and_refuses_all_streams(tmp_path: Path) -> N
         if error is not None:
             assert error["expected"], (case.name, error)
             lines.append(f"refused {error['message']}")
-        results.append(judge(case, Outcome(tuple(lines), int(error is not None))))
+        results.append(judge(case, cite(HERE, Outcome(tuple(lines), int(error is not None)))))
     assert [result for result in results if result.problem or result.left_out] == []
 
 
@@ -187,6 +187,24 @@ def test_the_suite_notices_arithmetic_of_another_order_or_width(
     monkeypatch.setattr(f"gsstream.{place}", function)
     cases = [case for case in CASES if {"rounding", "extremes", "decoder"} & set(case.features)]
     assert [case for case in cases if judge(case, play_here(case.path)).problem]
+
+
+def test_a_refusal_for_another_reason_fails() -> None:
+    """A decoder may refuse the right streams for wrong reasons; where it cites rules it is told so."""
+    for case in (case for case in CASES if case.refused):
+        others = sorted(rules() - set(case.rules))
+        for cited, is_right in ((case.rules[0], True), (f"{others[0]} {case.rules[-1]}", True), (others[0], False)):
+            found = judge(case, Outcome((*case.frames, f"refused by {cited}: why"), 1))
+            assert (found.problem is None) == is_right, (case.name, cited)
+        unknown = cite(HERE, Outcome((*case.frames, "refused what nobody says (at byte 3)"), 1))
+        assert "got R-0.1-1" in str(judge(case, unknown).problem)
+
+
+def test_every_row_of_the_table_of_messages_is_needed_and_names_rules_that_exist() -> None:
+    known = json.loads((HERE / "messages.json").read_text())
+    assert {rule for _, named in known for rule in named} <= rules()
+    assert all(RULE.search(words) is None for words, _ in known)
+    assert len({words for words, _ in known}) == len(known)
 
 
 def test_the_table_counts_every_stream_once_for_each_feature() -> None:

@@ -75,7 +75,11 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         write(Path(name))
         files = [
-            {p.relative_to(top): p.read_bytes() for p in top.rglob("*") if p.suffix in (".gss", ".json")}
+            {
+                p.relative_to(top): p.read_bytes()
+                for p in top.rglob("*")
+                if p.suffix == ".gss" or p.name == "vectors.json"
+            }
             for top in (FOLDER, Path(name))
         ]
     differ = sorted(str(name) for name in {*files[0], *files[1]} if files[0].get(name) != files[1].get(name))

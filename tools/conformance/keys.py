@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -212,6 +213,10 @@ def _metas() -> Iterator[Vector]:
         extra={"note": "a longer text, a longer text, of which much comes again " * 40, "list": list(range(900))}
     )
     yield playing("meta-compressed-longer", "meta", "3.2-1 3.2-3", told(compress(more), frame=True))
+    frame = plain_frame(meta_json())
+    for size, flag in ((1, 1), (2, 2), (4, 3)):
+        nameless = frame[:4] + bytes([frame[4] | flag]) + bytes(size) + frame[5:]
+        yield playing(f"meta-dictionary-0-of-{size}-bytes", "meta", "3.2-2", told(nameless, frame=True))
     yield playing("meta-unknown-entries", "meta", "3.2-9", told(put(lens={"k1": 0.1}, later=None)))
     deep = b"[" * 98 + b"]" * 98
     yield playing("meta-100-deep", "meta", "3.2-5", told(put(extra={"a": "X"}).replace(b'"X"', deep)))
@@ -224,6 +229,7 @@ def _metas() -> Iterator[Vector]:
         "3.2-6 3.3-1",
         told(_rig("width", b"32", b"3.2e1").replace(b'"height":32', b'"height":32.0')),
     )
+    yield from _numbers(told)
     yield playing(
         "meta-entry-twice", "meta", "3.2-6", told(meta_json().replace(b'"fps":30.0', b'"fps":"x","fps":30.0'))
     )
@@ -241,6 +247,17 @@ def _metas() -> Iterator[Vector]:
         {**key_sections(scene(81, 3), layout(81, 3, 1), first=np.arange(3) == 1), "meta": compress(put(world=world))}
     )
     yield playing("layers-meta-compressed", "layers meta", "3.8-3 3.8-4", Tape().key(both))
+
+
+def _numbers(told: Callable[[bytes], Tape]) -> Iterator[Vector]:
+    """Numbers of meta that count by their value in float64, whatever their text says."""
+    long = _rig("width", b"32", b"32.00000000000000000001").replace(b'"height":32', b'"height":320000000e-7')
+    yield playing("meta-whole-by-its-value", "meta cameras", "3.2-6 3.3-1 3.3-3", told(long))
+    for name, focal in (("least-determinant", (1e-6, 1.000002e-6)), ("determinant-beyond-float32", (3e38, 3e38))):
+        value = json.loads(meta_json())
+        value["train"] = {**_of(["a"]), "Ks": [[focal[0], 0, 16, 0, focal[1], 16, 0, 0, 1]]}
+        text = json.dumps(value, separators=(",", ":")).encode()
+        yield playing(f"meta-{name}", "meta cameras", "3.3-6", told(text))
 
 
 def _of(ids: list[str]) -> dict[str, Any]:

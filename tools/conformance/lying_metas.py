@@ -47,6 +47,7 @@ def _frames() -> Iterator[Vector]:
         ),
         "block-of-no-type": (reserved, "3.2-3"),
         "compressed-cut": (packed[:-9], "3.2-3"),
+        "dictionary-of-4-bytes": (b"\x28\xb5\x2f\xfd\xa3\0\0\0\1" + frame[5:], "3.2-2"),
     }
     for name, (data, rules) in frames.items():
         yield refusing(f"meta-frame-{name}", "meta", rules, lie({**base(0), "meta": data}))
@@ -168,6 +169,7 @@ RIGS: list[tuple[str, str, dict[str, Any]]] = [
     ("width-0", "3.3-3", {"width": 0}),
     ("width-65537", "3.3-3", {"width": 65537}),
     ("width-half", "3.3-3", {"width": 32.5}),
+    ("width-above-64-bits", "3.3-3", {"width": 1 << 80}),
     ("height-a-text", "3.3-1", {"height": "32"}),
     ("height-true", "3.3-1", {"height": True}),
     ("pixels", "3.3-3", {"width": 65536, "height": 2049}),
@@ -187,6 +189,7 @@ RIGS: list[tuple[str, str, dict[str, Any]]] = [
     ("K-skew", "3.3-6", {"Ks": [_lens((1, 0.1))]}),
     ("K-last-row", "3.3-6", {"Ks": [_lens((8, 2))]}),
     ("K-not-invertible", "3.3-6", {"Ks": [_lens((0, 1e-8), (4, 1e-8))]}),
+    ("K-a-little-too-small", "3.3-6", {"Ks": [_lens((0, 1e-6), (4, 0.999998e-6))]}),
 ]
 
 

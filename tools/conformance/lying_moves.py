@@ -127,6 +127,9 @@ def _fields() -> Iterator[Vector]:
     yield refusing("field-two-levels-of-2-20", "field", "4.5-2", begun().refused([("field", entries)]))
     cells = data[:1] + b"\x10" + data[2:6] + struct.pack("<H", 1024) + data[8:20] + struct.pack("<f", 4) + data[24:]
     yield refusing("field-too-many-cells", "field", "4.5-5", begun().refused([("field", cells)]))
+    for name, base in (("beyond-32-bits", 3), ("of-2-32", 4)):  # base times 4^15; the second is 0 in 32 bits
+        many = cells[:6] + struct.pack("<H", base) + cells[8:]
+        yield refusing(f"field-cells-{name}", "field", "4.5-5", begun().refused([("field", many)]))
     yield refusing("field-cut", "field", "1.3-6", begun().refused([("field", data[:51])]))
     yield refusing("field-without-parts", "field", "2.2-2 1.3-6", begun().refused([("field", data[:52])]))
     assert data[52] == 0, "the part of marks is empty"

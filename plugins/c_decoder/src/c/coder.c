@@ -286,7 +286,7 @@ int gss_gates(gss_stream *s, span from, uint32_t entries, int one_level, gates *
         at += count;
     }
     if (levels == 1) {
-        NEED(s, part[3].size == 0, "R-1.3-6");
+        NEED(s, part[3].size == 0, "R-2.3-1");
         return 1;
     }
     int32_t *level;

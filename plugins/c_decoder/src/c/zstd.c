@@ -198,20 +198,23 @@ static int read_head(unpacker *z, span *from, int *checksum)
 {
     NEED(z->s, from->size >= 5 && u32_at(from->at) == 0xFD2FB528, "R-3.2-1");
     unsigned flags = from->at[4], single = flags >> 5 & 1, size_flag = flags >> 6;
-    unsigned sized = size_flag ? 1u << size_flag : single, at = 5;
+    unsigned sized = size_flag ? 1u << size_flag : single, at = 5, named = (1u << (flags & 3)) >> 1;
     NEED(z->s, !(flags & 8), FAULTY);
-    NEED(z->s, sized && !(flags & 3), "R-3.2-2");
-    NEED(z->s, from->size >= 5 + (single ? 0 : 1) + sized, FAULTY);
+    NEED(z->s, sized, "R-3.2-2");
+    NEED(z->s, from->size >= 5 + (single ? 0 : 1) + named + sized, FAULTY);
     uint64_t window = 0, size = 0;
     if (!single) {
         unsigned b = from->at[at++];
         window = ((uint64_t)1 << (10 + (b >> 3)));
         window += window / 8 * (b & 7);
     }
+    for (; named; named--)
+        NEED(z->s, from->at[at++] == 0, "R-3.2-2");
     for (unsigned i = 0; i < sized; i++)
         size |= (uint64_t)from->at[at++] << 8 * i;
     size += sized == 2 ? 256 : 0;
-    NEED(z->s, size >= 2 && size <= MOST_META, "R-3.2-3");
+    NEED(z->s, size <= MOST_META, "R-3.2-3");
+    NEED(z->s, size >= 2, "R-3.2-4");
     window = single ? size : window;
     z->size = (uint32_t)size;
     z->most = window < MOST_BLOCK ? (uint32_t)window : MOST_BLOCK;

@@ -29,7 +29,7 @@ pytestmark = [
 #: Spark sorts in a worker and shows the order one picture later, so several are drawn.
 PICTURE = """(async () => {{
   stream.player.pause(); spark.preBlurAmount = 0.3; ring.visible = false; renderer.setAnimationLoop(null);
-  renderer.setSize({width}, {height}, false); camera.aspect = {width} / {height}; stream.place(camera);
+  renderer.setSize({width}, {height}, false); stream.player.look(0); stream.place(camera);
   stream.player.seek({frame});
   while (stream.player.frame !== {frame}) await new Promise(requestAnimationFrame);
   for (let i = 0; i < 8 || spark.sorting || spark.sortDirty; i += 1) {{
@@ -69,26 +69,33 @@ def test_pictures_and_uploads(tmp_path):
       return [whole, stream.source.uploaded, stream.source.getNumSplats()];
     })()"""
     eye = ["evaluate", "camera.position.toArray()"]
+    opacity = "Number(renderer.domElement.style.opacity)"
     blur = "[spark.preBlurAmount, spark.uniforms.preBlurAmount.value, renderer.domElement.height]"
     with serving(tmp_path / "page") as (url, _), Playback(stream) as playback:
         steps = [
             ["go", f"{url}/index.html"],
             ["until", ready],
             eye,
-            ["drag", 60, 60, 60, 0],
+            ["drag", 60, 60, 20, 0],
             eye,
             ["evaluate", blur],
+            ["hold", 48, 36, 300, 0],
+            ["until", f"{opacity} < 1"],
+            ["evaluate", opacity],
+            ["release", 348, 36],
+            ["until", f"{opacity} === 1"],
             *ask,
             ["evaluate", small],
         ]
         results = in_browser(steps, tmp_path, size=(3 * rig.width, 3 * rig.height))
         before, _, after, (amount, used, height) = results[2:6]
         assert math.dist(before, after) > 0.01, "a drag turns"
+        assert 0.4 <= results[8] < 1, "a view outside of the recorded region fades, and springs back"
         assert height == 3 * rig.height
         assert (amount, used) == (pytest.approx(9 * 0.3), pytest.approx(9 * 0.3))
-        for frame, text in zip(frames, results[6:-1], strict=True):
+        for frame, text in zip(frames, results[11:-1], strict=True):
             picture = decoded(text, rig.width, rig.height)[::-1]
-            found = psnr(drawn(playback, frame, (0.0, 0.0, 0.0)), picture)
+            found = psnr(drawn(playback, frame), picture)
             print(frame, found)
             assert found >= 30, frame
     whole, part, splats = results[-1]

@@ -6,7 +6,7 @@
 import { SplatMesh, dyno } from "@sparkjsdev/spark";
 import * as THREE from "three";
 
-import { pivotOf, viewsOf } from "./site/camera.js";
+import { cameraOf } from "./site/camera.js";
 import { Player } from "./site/player.js";
 import { SceneTextures } from "./site/scene-textures.js";
 import { colourFunction } from "./site/shaders.js";
@@ -34,6 +34,8 @@ class StreamSource {
     this.most = 3;
     this.uploaded = 0;
     this.changed = false;
+    /** Colour behind everything. */
+    this.background = [0, 0, 0];
   }
 
   // What a player asks of its renderer.
@@ -57,6 +59,7 @@ class StreamSource {
       this[name].value = new THREE.ExternalTexture(texture);
       this[name].uniform.value = this[name].value;
     }
+    this.background = update.background;
     this.changed = true;
     return true;
   }
@@ -179,26 +182,27 @@ export class SplatStream {
   /** The turn that takes the recording's up direction to y, as a Quaternion. */
   get upright() {
     return new THREE.Quaternion().setFromUnitVectors(
-      new THREE.Vector3(...pivotOf(this.player.views).up),
+      new THREE.Vector3(...this.player.pivot.up),
       new THREE.Vector3(0, 1, 0),
     );
   }
 
-  /** Put a PerspectiveCamera where a camera of the recording stands, as far as such a camera can show its picture. */
-  place(camera, id = null) {
-    const views = viewsOf(this.player.state.meta);
-    const view = views.find((one) => one.id === id) ?? views[0];
+  /** Put a PerspectiveCamera where the player's view is, as far as such a camera can show its picture. */
+  place(camera) {
+    const { view } = this.player;
     const [x, y, z] = [view.right, view.down.map((v) => -v), view.forward.map((v) => -v)];
     const basis = new THREE.Matrix4().makeBasis(...[x, y, z].map((axis) => new THREE.Vector3(...axis)));
     basis.setPosition(...view.eye).premultiply(this.mesh.matrixWorld);
     basis.decompose(camera.position, camera.quaternion, new THREE.Vector3());
-    camera.fov = (360 / Math.PI) * Math.atan(view.height / (2 * view.fy));
+    const { width, height } = this.source.renderer.domElement;
+    const { fx, fy, cx, cy } = cameraOf(view, width, height);
+    Object.assign(camera, { aspect: width / height, fov: (360 / Math.PI) * Math.atan(height / (2 * fy)) });
     camera.updateProjectionMatrix();
-    // The principal point need not lie in the middle, and pixels need not be square.
+    // The middle of the view need not be that of its picture, nor its pixels be square.
     const matrix = camera.projectionMatrix;
-    matrix.elements[0] = ((2 * view.fx) / view.width) * ((view.width / view.height) / camera.aspect);
-    matrix.elements[8] = 1 - (2 * view.cx) / view.width;
-    matrix.elements[9] = (2 * view.cy) / view.height - 1;
+    matrix.elements[0] = (2 * fx) / width;
+    matrix.elements[8] = 1 - (2 * cx) / width;
+    matrix.elements[9] = (2 * cy) / height - 1;
     camera.projectionMatrixInverse.copy(matrix).invert();
   }
 

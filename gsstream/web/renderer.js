@@ -1,6 +1,6 @@
 // Draws a scene with WebGL2 from float32 textures, in the depth order that a worker finds.
 
-import { SceneTextures } from "./scene-textures.js";
+import { SceneTextures, plainTexture } from "./scene-textures.js";
 import { COPY_FRAGMENT_SHADER, COPY_VERTEX_SHADER } from "./shaders.js";
 import { SortQueue } from "./sort-queue.js";
 import { Projection, Quads, link } from "./splats.js";
@@ -93,15 +93,11 @@ export class Renderer {
     const { gl } = this;
     this._fitTarget(width, height);
     this.projection.update(this.textures, camera, { width, height }, this.marks ? this.frame : -1);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target ? this.target.buffer : framebuffer);
-    gl.viewport(this.target ? 0 : x, this.target ? 0 : y, width, height);
-    gl.enable(gl.SCISSOR_TEST);
-    gl.scissor(this.target ? 0 : x, this.target ? 0 : y, width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target.buffer);
+    gl.viewport(0, 0, width, height);
     gl.clearColor(...this.background, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    gl.disable(gl.SCISSOR_TEST);
     this.quads.draw(this.sorter.order, this.projection, { width, height });
-    if (!this.target) return;
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
     gl.viewport(x, y, width, height);
     gl.useProgram(this.copy.handle);
@@ -122,10 +118,11 @@ export class Renderer {
     const { gl } = this;
     // Hundreds of layers are blended into one pixel: eight bits would round each of them.
     const floats = gl.getExtension("EXT_color_buffer_float");
-    this.deep = Boolean(floats || gl.getExtension("EXT_color_buffer_half_float"));
+    const deep = floats || gl.getExtension("EXT_color_buffer_half_float");
     // A processor that has to draw takes as long to convert halves as for all the rest.
     const software = /swiftshader|llvmpipe|software/i.test(rendererOf(gl));
-    this.format = software && floats && gl.getExtension("EXT_float_blend") ? gl.RGBA32F : gl.RGBA16F;
+    const whole = software && floats && gl.getExtension("EXT_float_blend");
+    this.format = whole ? gl.RGBA32F : deep ? gl.RGBA16F : gl.RGBA8;
     this.projection = new Projection(gl);
     this.quads = new Quads(gl);
     this.copy = link(gl, COPY_VERTEX_SHADER, COPY_FRAGMENT_SHADER);
@@ -137,16 +134,12 @@ export class Renderer {
 
   _fitTarget(width, height) {
     const { gl } = this;
-    if (!this.deep || (this.target?.width === width && this.target.height === height)) return;
+    if (this.target?.width === width && this.target.height === height) return;
     if (this.target) {
       gl.deleteTexture(this.target.texture);
       gl.deleteFramebuffer(this.target.buffer);
     }
-    const texture = gl.createTexture();
-    gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, this.format, width, height);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    const texture = plainTexture(gl, this.format, width, height);
     const buffer = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);

@@ -2,6 +2,16 @@
 
 import { GEOMETRY_TEXELS, colourTexels, shiftOf } from "./texels.js";
 
+/** A texture that is read texel by texel. */
+export function plainTexture(gl, format, width, height) {
+  const texture = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+  return texture;
+}
+
 /** One texture of `texels` RGBA texels a Gaussian. */
 class AttributeTexture {
   constructor(gl, texels, capacity) {
@@ -10,11 +20,7 @@ class AttributeTexture {
     if (lines > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
       throw new RangeError(`this browser's graphics cannot hold ${capacity} Gaussians`);
     }
-    this.texture = gl.createTexture();
-    gl.bindTexture(gl.TEXTURE_2D, this.texture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32F, 2 ** this.shift * texels, lines);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    this.texture = plainTexture(gl, gl.RGBA32F, 2 ** this.shift * texels, lines);
   }
 
   /** Upload one part of what was packed; returns the bytes sent. */

@@ -1,5 +1,6 @@
 // Gaussians drawn in two steps: each is projected once, into textures of integers; then quads are blended, far to near.
 
+import { plainTexture } from "./scene-textures.js";
 import { COPY_VERTEX_SHADER, FRAGMENT_SHADER, VERTEX_SHADER, projectionShader } from "./shaders.js";
 
 /** Variance that every footprint gets, in pixels squared of the recording: a larger picture is not made of needles. */
@@ -65,11 +66,7 @@ export class Projection {
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.buffer);
     const targets = [gl.COLOR_ATTACHMENT0, gl.COLOR_ATTACHMENT1];
     this.textures = targets.map((target) => {
-      const texture = gl.createTexture();
-      gl.bindTexture(gl.TEXTURE_2D, texture);
-      gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, 2 ** shift, lines);
-      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+      const texture = plainTexture(gl, gl.RGBA32UI, 2 ** shift, lines);
       gl.framebufferTexture2D(gl.FRAMEBUFFER, target, gl.TEXTURE_2D, texture, 0);
       return texture;
     });
@@ -114,11 +111,7 @@ export class Quads {
     const lines = Math.ceil((1.25 * number) / 2 ** SHIFT);
     this.room = lines * 2 ** SHIFT;
     if (this.texture) gl.deleteTexture(this.texture);
-    this.texture = gl.createTexture();
-    gl.bindTexture(gl.TEXTURE_2D, this.texture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.R32UI, 2 ** SHIFT, lines);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    this.texture = plainTexture(gl, gl.R32UI, 2 ** SHIFT, lines);
     const indices = new Uint32Array(6 * this.room);
     for (let quad = 0, at = 0; quad < this.room; quad += 1) {
       for (const corner of [0, 1, 2, 2, 1, 3]) indices[at++] = 4 * quad + corner;

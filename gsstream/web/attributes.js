@@ -3,7 +3,7 @@
 import { unpackParts } from "./bits.js";
 import { PacketError, located } from "./errors.js";
 import { MAX_BITS, MAX_CODE, WIDTHS } from "./limits.js";
-import { decodeSymbols } from "./symbols.js";
+import { decodeSymbols, within } from "./symbols.js";
 
 const MAX_DEPTH = 24;
 const MAX_EXPONENT = 60;
@@ -39,10 +39,7 @@ function decodeCodes(name, data, number) {
   const payload = data.subarray(2);
   if (name === "quats") return { codes: unfoldQuats(decodeSymbols(payload, number, 5), bits), bits, width };
   const codes = decodeSymbols(payload, number, width);
-  for (let i = 0; i < codes.length; i += 1) {
-    if (codes[i] >= MAX_CODE || codes[i] <= -MAX_CODE) throw new PacketError(`${name}: code out of range`);
-  }
-  return { codes, bits, width };
+  return { codes: within(codes, 1 - MAX_CODE, MAX_CODE - 1, `${name}: code out of range`), bits, width };
 }
 
 /** Codes of quaternions from five symbols each: the largest component is what the unit norm leaves for it. */
@@ -50,17 +47,15 @@ function unfoldQuats(symbols, bits) {
   const number = symbols.length / 5;
   const out = new Int32Array(4 * number);
   const one = 4 ** bits;
+  within(symbols.subarray(0, number), 0, 3, "quats: the index of the largest component is outside 0 to 3");
+  within(symbols.subarray(number, 4 * number), 1 - MAX_CODE, MAX_CODE - 1, "quats: code out of range");
   for (let i = 0; i < number; i += 1) {
     const largest = symbols[i];
-    if (largest < 0 || largest > 3) {
-      throw new PacketError("quats: the index of the largest component is outside 0 to 3");
-    }
     let squares = 0;
     let most = 0;
     for (let k = 0, to = 0; k < 3; k += 1, to += 1) {
       if (to === largest) to += 1;
       const code = symbols[(1 + k) * number + i];
-      if (code >= MAX_CODE || code <= -MAX_CODE) throw new PacketError("quats: code out of range");
       out[to * number + i] = code;
       squares += code * code;
       most = Math.max(most, Math.abs(code));

@@ -11,24 +11,11 @@ export function viewsOf(meta) {
     const rig = meta[split];
     return rig.ids.map((id, i) => {
       const m = rig.viewmats[i];
-      const K = rig.Ks[i];
       const [right, down, forward] = [0, 4, 8].map((row) => m.slice(row, row + 3));
       const eye = [0, 1, 2].map((k) => -(right[k] * m[3] + down[k] * m[7] + forward[k] * m[11]));
-      return {
-        id,
-        split,
-        eye,
-        right,
-        down,
-        forward,
-        fx: K[0],
-        fy: K[4],
-        cx: K[2],
-        cy: K[5],
-        width: rig.width,
-        height: rig.height,
-        near: rig.near,
-      };
+      const [fx, fy, cx, cy] = [0, 4, 2, 5].map((k) => rig.Ks[i][k]);
+      const { width, height, near } = rig;
+      return { id, split, eye, right, down, forward, fx, fy, cx, cy, width, height, near };
     });
   });
 }

@@ -46,20 +46,8 @@ function keyState(header, sections, size, offset) {
 /** The state of a key packet, or of its first layer, which has no `layout`. */
 export function firstState(frame, number, { scene, layout, meta, rest }) {
   const widths = { means: 3, quats: 4, scales: 3, opacities: 1, sh0: 3, shN: rest };
-  return {
-    frame,
-    number,
-    scene,
-    widths,
-    layout,
-    meta,
-    decoders: new Map(),
-    groups: null,
-    displacement: null,
-    turned: false,
-    spare: null,
-    change: { kind: "key" },
-  };
+  const before = { decoders: new Map(), groups: null, displacement: null, turned: false, spare: null };
+  return { frame, number, scene, widths, layout, meta, ...before, change: { kind: "key" } };
 }
 
 /** Sections of a delta packet in their order. */
@@ -119,29 +107,7 @@ function applyDelta(state, { motions, residual, rows }) {
 }
 
 /** A copy of a state that later packets do not touch. */
-function copied(state) {
+export function copied(state) {
   const scene = Object.fromEntries(Object.entries(state.scene).map(([name, values]) => [name, values.slice()]));
   return { ...state, scene, decoders: new Map(state.decoders), spare: null };
-}
-
-/** The first key packet and the one used last. */
-export class Snapshots {
-  constructor() {
-    this.kept = [];
-  }
-
-  clear() {
-    this.kept = [];
-  }
-
-  /** A fresh copy of the state after a key packet, or null. */
-  get(packet) {
-    const found = this.kept.find((entry) => entry.packet === packet);
-    return found ? copied(found.state) : null;
-  }
-
-  keep(packet, state) {
-    if (this.kept.length === 2) this.kept.pop();
-    this.kept.push({ packet, state: copied(state) });
-  }
 }

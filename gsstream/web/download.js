@@ -9,24 +9,9 @@ export class SourceError extends Error {
 }
 
 const RETRIES = 4;
-const FIRST_PAUSE = 300;
 
 /** How downloads are made; tests shorten the waiting. */
-export const settings = { patience: 15_000, firstPause: FIRST_PAUSE, fetch: (...args) => globalThis.fetch(...args) };
-
-function sleep(milliseconds, signal) {
-  return new Promise((resolve, reject) => {
-    const timer = setTimeout(resolve, milliseconds);
-    signal?.addEventListener(
-      "abort",
-      () => {
-        clearTimeout(timer);
-        reject(signal.reason);
-      },
-      { once: true },
-    );
-  });
-}
+export const settings = { patience: 15_000, firstPause: 300, fetch: (...args) => globalThis.fetch(...args) };
 
 /** Ask for bytes `start` to `end` (inclusive; null: to the end) of a file; `ranged` false asks for all of it. */
 export async function request(url, { start = 0, end = null, ranged = true, signal } = {}) {
@@ -99,7 +84,8 @@ export async function* bytesOf(url, { start = 0, end = null, whole = false, all 
       // Nothing came yet: there may be a reason for which waiting does not help.
       if (at === start) await forbidden(url, error);
       if (failures > RETRIES) throw new SourceError(`${sentence(error)} What was loaded until then is played.`);
-      await sleep(settings.firstPause * 2 ** (failures - 1), signal);
+      await new Promise((resolve) => setTimeout(resolve, settings.firstPause * 2 ** (failures - 1)));
+      signal?.throwIfAborted();
     }
   }
 }
@@ -112,13 +98,16 @@ function firstByte(response, url, at) {
   }
   if (response.status === 200) return 0;
   if (response.status === 416) return null;
-  const error = new SourceError(
-    response.status === 401
+  throw refusal(response, url);
+}
+
+/** What an answer that is neither a file nor a part of one means. */
+export function refusal({ status }, url) {
+  const said =
+    status === 401
       ? "This stream needs a token: add ?token=… to the address of the page."
-      : `There is no stream at ${url}: the server answers ${response.status}. Look whether the address is right.`,
-  );
-  error.final = response.status < 500;
-  throw error;
+      : `There is no stream at ${url}: the server answers ${status}. Look whether the address is right.`;
+  return Object.assign(new SourceError(said), { final: status < 500 });
 }
 
 /** Chunks that begin at byte `first` of the file, without what lies before `at` or after `end`. */
@@ -135,8 +124,13 @@ async function* clipped(chunks, first, at, end) {
 
 /** All bytes of a file at once. Throws SourceError. */
 export async function fileOf(url, { bytes = null, signal } = {}) {
+  return joined(bytesOf(url, { end: bytes && bytes - 1, whole: true, signal }));
+}
+
+/** Chunks as one array. */
+export async function joined(chunks) {
   const parts = [];
-  for await (const chunk of bytesOf(url, { end: bytes && bytes - 1, whole: true, signal })) parts.push(chunk);
+  for await (const chunk of chunks) parts.push(chunk);
   return new Uint8Array(await new Blob(parts).arrayBuffer());
 }
 

@@ -18,3 +18,8 @@ export function located(offset, read) {
     throw error;
   }
 }
+
+/** What `read` makes of the bytes of a section `{ data, offset }`; null where there is no section. */
+export function ofSection(section, read) {
+  return section ? located(section.offset, () => read(section.data)) : null;
+}

@@ -1,7 +1,7 @@
 // A stream file by itself, with or without an index. The player of a package never loads this.
 
 import { FILE_HEADER, parseHeader, parseIndex } from "./container.js";
-import { SourceError, bytesOf, chunksOf, forbidden, request } from "./download.js";
+import { SourceError, bytesOf, chunksOf, forbidden, joined, refusal, request } from "./download.js";
 
 const TRAILER = 12;
 
@@ -18,8 +18,7 @@ export async function openFile(url, signal) {
   });
   if (response.status === 200) return plain(response);
   if (response.status === 416) return plain();
-  if (response.status !== 206)
-    throw new SourceError(`There is no stream at ${url}: the server answers ${response.status}. Look whether the address is right.`);
+  if (response.status !== 206) throw refusal(response, url);
   const total = /\/(\d+)$/.exec(response.headers.get("Content-Range") ?? "");
   const tail = new Uint8Array(await response.arrayBuffer());
   if (!total || tail.length !== TRAILER || String.fromCharCode(...tail.subarray(8)) !== "GSSX") return plain();
@@ -37,9 +36,7 @@ export async function openFile(url, signal) {
 /** Segments by the index at the end of a file; null when it is none after all. */
 async function indexed(url, offset, total, signal) {
   if (offset < FILE_HEADER || offset >= total) return null;
-  const parts = [];
-  for await (const chunk of bytesOf(url, { start: offset, end: total - 1, signal })) parts.push(chunk);
-  const data = new Uint8Array(await new Blob(parts).arrayBuffer());
+  const data = await joined(bytesOf(url, { start: offset, end: total - 1, signal }));
   try {
     const keys = parseIndex(data, offset);
     const last = parseHeader(data, offset).frame;

@@ -8,7 +8,7 @@ import { PacketError, located } from "./errors.js";
 import { ATTRIBUTES, FREE_GAUSSIANS, MAX_GAUSSIANS, MAX_GAUSSIANS_PER_BYTE } from "./limits.js";
 import { MAX_META, MAX_UNIT, MAX_UNITS } from "./limits.js";
 import { parseMeta } from "./meta.js";
-import { decodeSymbols, range } from "./symbols.js";
+import { decodeSymbols, within } from "./symbols.js";
 import { decompress } from "./vendor/fzstd.js";
 
 /** `layers` decodes packets with layers, once who meets one has loaded layers.js. */
@@ -77,12 +77,8 @@ function decodeLayout(data, most) {
 
 /** [number] indices of units, each below `kinds`. */
 export function decodeUnits(data, number, kinds) {
-  const symbols = decodeSymbols(data, number, 1);
-  if (number) {
-    const [low, high] = range(symbols);
-    if (low < 0 || high >= kinds) throw new PacketError(`layout: units ${low} to ${high} are named, ${kinds} given`);
-  }
-  return Uint8Array.from(symbols);
+  const message = `layout: a unit is named beyond the ${kinds} given`;
+  return Uint8Array.from(within(decodeSymbols(data, number, 1), 0, kinds - 1, message));
 }
 
 /** Decode the meta section. What a player does not use (the recipe and its hash) is handed on unchecked. */

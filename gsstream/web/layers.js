@@ -90,3 +90,16 @@ function soundLayer(data) {
   const scene = decodeAttributes(found, count);
   return firstState(frame, count, { scene, layout: null, meta: decodeMeta(found.meta.data), rest: found.shN.data[1] });
 }
+
+const looked = new WeakSet();
+
+/** Say the first layer of the packet whose first bytes `walker` has, once, while `stream` has nothing else to say. */
+export function look(stream, walker) {
+  const head = walker.ahead(START);
+  if (!head || stream.state || looked.has(walker)) return;
+  const data = walker.ahead(START + headOf(head.subarray(START - 12))[1]);
+  if (!data) return;
+  looked.add(walker);
+  const state = firstLayer(data);
+  if (state?.frame === stream.target) stream.sendEarly(state);
+}

@@ -3,7 +3,7 @@
 
 import { KIND } from "./container.js";
 import { PacketBuffer } from "./buffer.js";
-import { Snapshots, decodePacket } from "./decode.js";
+import { copied, decodePacket } from "./decode.js";
 import { forbidden } from "./download.js";
 import { PacketError } from "./errors.js";
 import { Packer } from "./packing.js";
@@ -24,7 +24,8 @@ export class Stream {
   /** `post(message, buffers)` says a message and gives buffers away; it decodes for `budget` milliseconds, then hears. */
   constructor(post, budget) {
     Object.assign(this, { post, budget, number: 0, serial: 0, playing: false, running: false, timer: null });
-    this.snapshots = new Snapshots();
+    /** The states after the first key packet and the one used last. */
+    this.keys = [];
     this.packer = new Packer();
     this.source = this.buffer = this.state = this.target = null;
     this.statistics = { decode: 0, bytes: 0 };
@@ -171,13 +172,13 @@ export class Stream {
   }
 
   _start(segments, frame) {
-    this.snapshots.clear();
+    this.keys = [];
     this.packer = new Packer();
     this.meta = null;
     this.packets = 0;
     this.key = false;
     // A part of a packet may be enough for a first picture.
-    const early = (walker) => this.state || import("./early.js").then(({ look }) => look(this, walker), () => {});
+    const early = (walker) => this.state || import("./layers.js").then(({ look }) => look(this, walker), () => {});
     this.buffer = this.source.follow?.(this) ?? new PacketBuffer(segments, () => this._news(), early);
     this.buffer.fps = this.source.fps ?? 30;
     this.target = this.buffer.live ? null : (frame ?? this.buffer.first ?? 0);
@@ -250,10 +251,11 @@ export class Stream {
 
   /** The state after a key packet, decoded once for several uses. */
   _keyState(packet) {
-    const known = this.snapshots.get(packet);
-    if (known) return known;
-    const state = decodePacket(null, packet.data, packet.offset);
-    this.snapshots.keep(packet, state);
-    return state;
+    let known = this.keys.find((entry) => entry.packet === packet);
+    if (!known) {
+      known = { packet, state: decodePacket(null, packet.data, packet.offset) };
+      this.keys[Math.min(this.keys.length, 1)] = known;
+    }
+    return copied(known.state);
   }
 }

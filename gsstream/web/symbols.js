@@ -84,15 +84,17 @@ function readCounts(head, number) {
   return counts;
 }
 
-/** Smallest and largest value of a table that is not empty. */
-export function range(values) {
-  let low = values[0];
-  let high = values[0];
-  for (let i = 1; i < values.length; i += 1) {
-    if (values[i] < low) low = values[i];
-    else if (values[i] > high) high = values[i];
-  }
-  return [low, high];
+/** The largest magnitude in a table; 0 of an empty one. */
+export function largest(values) {
+  let most = 0;
+  for (let i = 0; i < values.length; i += 1) most = Math.max(most, Math.abs(values[i]));
+  return most;
+}
+
+/** The table, of which no value may lie outside of `low` to `high`: else a PacketError says so. */
+export function within(values, low, high, message) {
+  for (let i = 0; i < values.length; i += 1) if (values[i] < low || values[i] > high) throw new PacketError(message);
+  return values;
 }
 
 // The entropy decoder: 64-bit state, 32-bit words, 24-bit models (sections 2.5 and 2.6 of docs/spec).
@@ -244,19 +246,15 @@ export function decodeGates(data, number) {
   const runs = new Float64Array(count);
   [even, odd].forEach((part, parity) => {
     const sent = Math.max(0, Math.ceil((count - 1 - parity) / 2));
-    const tokens = decodeSymbols(part, sent, 1);
-    checkTokens(tokens);
+    const tokens = within(decodeSymbols(part, sent, 1), 0, DIRECT + 2 * 28 - 1, "run-length token out of range");
     for (let i = 0; i < sent; i += 1) runs[2 * i + parity] = runLength(tokens[i], head) + 1;
   });
   head.finish();
   const gates = new Uint8Array(number);
-  const open = fillRuns(gates, runs, first);
-  const values = decodeSymbols(levelBytes, levels > 1 ? open : 0, 1);
-  if (values.length) {
-    const [low, high] = range(values);
-    if (low < 1 || high > levels) throw new PacketError(`gate level outside 1 to ${levels}`);
-    for (let i = 0, k = 0; i < number; i += 1) if (gates[i]) gates[i] = values[k++];
-  }
+  let open = fillRuns(gates, runs, first);
+  if (levels === 1) open = 0;
+  const values = within(decodeSymbols(levelBytes, open, 1), 1, levels, `gate level outside 1 to ${levels}`);
+  if (open) for (let i = 0, k = 0; i < number; i += 1) if (gates[i]) gates[i] = values[k++];
   return { gates, levels };
 }
 
@@ -279,12 +277,6 @@ function fillRuns(gates, runs, first) {
     at += runs[i];
   }
   return open;
-}
-
-function checkTokens(tokens) {
-  if (!tokens.length) return;
-  const [low, high] = range(tokens);
-  if (low < 0 || high >= DIRECT + 2 * 28) throw new PacketError("run-length token out of range");
 }
 
 function runLength(token, head) {

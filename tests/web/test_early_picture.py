@@ -193,4 +193,4 @@ def test_a_stream_without_layers_loads_nothing_for_them(tmp_path):
         in_browser(at(url, [["go", "URL/index.html"], READY]), tmp_path, size=(64, 48))
         asked = {path for path, _ in server.requests}
     assert "/decode.js" in asked
-    assert not {"/layers.js", "/early.js"} & asked
+    assert "/layers.js" not in asked

@@ -266,7 +266,7 @@ def test_the_page_is_small(site):
     sizes = {str(name): len(gzip.compress((site / name).read_bytes())) for name in files}
     # What only a live stream takes, a seek by a join, a stream without a package, a packet with layers and the
     # statistics is loaded only there.
-    names = ("live", "live-socket", "latency", "joins", "file", "statistics", "layers", "early", "xr")
+    names = ("live", "live-socket", "latency", "joins", "file", "statistics", "layers", "xr")
     later = [sizes.pop(f"{name}.js") for name in names]
     assert len(sizes) > 20
     assert sum(sizes.values()) <= 60_000

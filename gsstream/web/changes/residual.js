@@ -1,8 +1,8 @@
 // The residual of a delta packet: the Gaussians behind open gates change by decoded symbols.
 
-import { PacketError, located } from "../errors.js";
+import { PacketError, ofSection } from "../errors.js";
 import { ATTRIBUTES, MAX_CHANNELS, WIDTHS } from "../limits.js";
-import { decodeGates, decodeSymbols, range } from "../symbols.js";
+import { decodeGates, decodeSymbols, largest, within } from "../symbols.js";
 
 const LATENT = 1;
 const MAX_CHANGE = 1e18;
@@ -19,22 +19,18 @@ export const SECTIONS = ["gates", "pattern", "decoders", ...ATTRIBUTES];
  */
 export function decodeResidual(sections, state, offset) {
   const { counts } = state.layout;
-  const { gates, levels } = located(sections.gates.offset, () => decodeGates(sections.gates.data, counts.length));
+  const { gates, levels } = ofSection(sections.gates, (data) => decodeGates(data, counts.length));
   const { rows, gate } = openRows(counts, gates, levels);
   const decoders = new Map(state.decoders);
-  const sent = sections.decoders
-    ? located(sections.decoders.offset, () => decodeDecoders(sections.decoders.data))
-    : new Map();
+  const sent = ofSection(sections.decoders, decodeDecoders) ?? new Map();
   for (const [name, decoder] of sent) decoders.set(name, decoder);
   const names = ATTRIBUTES.filter((name) => sections[name]);
-  const pattern = sections.pattern
-    ? located(sections.pattern.offset, () => decodePattern(sections.pattern.data, rows.length, names.length))
-    : null;
+  const pattern = ofSection(sections.pattern, (data) => decodePattern(data, rows.length, names.length));
   const parts = names.map((name, bit) =>
-    located(sections[name].offset, () => {
+    ofSection(sections[name], (data) => {
       const places = pattern && placesOf(pattern, bit);
       const number = places ? places.length : rows.length;
-      return { ...decodePart(name, sections[name].data, number, decoders), places };
+      return { ...decodePart(name, data, number, decoders), places };
     }),
   );
   for (const name of sent.keys()) {
@@ -139,13 +135,8 @@ function openRows(counts, gates, levels) {
 /** For each row behind an open gate, a number: bit i is set where the i-th attribute sent has symbols for it. */
 function decodePattern(data, rows, attributes) {
   if (attributes === 0) throw new PacketError("pattern of rows without an attribute that changes");
-  const pattern = decodeSymbols(data, rows, 1);
-  for (let i = 0; i < rows; i += 1) {
-    if (pattern[i] < 0 || pattern[i] >= 1 << attributes) {
-      throw new PacketError(`pattern of a row: expected 0 to ${(1 << attributes) - 1} for ${attributes} attributes`);
-    }
-  }
-  return pattern;
+  const most = (1 << attributes) - 1;
+  return within(decodeSymbols(data, rows, 1), 0, most, `pattern of a row: expected 0 to ${most} for ${attributes} attributes`);
 }
 
 /** The places of a pattern that have a bit, ascending. */
@@ -212,12 +203,8 @@ function decodePart(name, data, rows, known) {
   const fits = decoder ? channels === decoder.latents : WIDTHS[name].includes(channels);
   if (!fits || channels === 0) throw new PacketError(`symbols of ${name}: ${channels} channels do not fit`);
   const symbols = decodeSymbols(data.subarray(6), rows, channels);
-  const [low, high] = symbols.length ? range(symbols) : [0, 0];
-  const largest = Math.max(high, -low);
-  const gain = decoder ? channels * decoder.values.reduce((most, v) => Math.max(most, Math.abs(v)), 0) : 1;
-  if (largest * step * gain > MAX_CHANGE) {
-    throw new PacketError(`${name}: a residual of ${largest * step * gain} cannot be`);
-  }
+  const change = largest(symbols) * step * (decoder ? channels * largest(decoder.values) : 1);
+  if (change > MAX_CHANGE) throw new PacketError(`${name}: a residual of ${change} cannot be`);
   return { name, symbols, channels, step, decoder, width: decoder ? decoder.width : channels };
 }
 

@@ -2,7 +2,7 @@
 
 import { decodeAttributes } from "../attributes.js";
 import { BitReader, unpackParts } from "../bits.js";
-import { PacketError, located } from "../errors.js";
+import { PacketError, ofSection } from "../errors.js";
 import { decodeUnits } from "../key.js";
 import { ATTRIBUTES, MAX_GAUSSIANS, MAX_GAUSSIANS_PER_BYTE } from "../limits.js";
 import { decodeGates, decodeSymbols } from "../symbols.js";
@@ -20,16 +20,11 @@ const HEAD_PARTS = 5;
  */
 export function decodeRows(sections, state, offset) {
   const number = state.layout.unitOf.length;
-  const removed = sections.removed
-    ? located(sections.removed.offset, () => decodeRemoved(sections.removed.data, number))
-    : null;
-  let added = null;
-  if (sections.added) {
-    const leaving = removed ? removed.reduce((sum, flag) => sum + flag, 0) : 0;
-    const most = MAX_GAUSSIANS - (number - leaving);
-    added = located(sections.added.offset, () => decodeAdded(sections.added, state.layout, most));
-    checkWidths(added, state, offset);
-  }
+  const removed = ofSection(sections.removed, (data) => decodeRemoved(data, number));
+  const leaving = removed ? removed.reduce((sum, flag) => sum + flag, 0) : 0;
+  const most = MAX_GAUSSIANS - (number - leaving);
+  const added = ofSection(sections.added, () => decodeAdded(sections.added, state.layout, most));
+  if (added) checkWidths(added, state, offset);
   return { removed, added };
 }
 

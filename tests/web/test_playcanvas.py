@@ -107,10 +107,18 @@ def test_a_view_outside_of_the_recorded_region_fades_and_springs_back(tmp_path):
     eye = ["evaluate", "[camera.getPosition().x, camera.getPosition().y, camera.getPosition().z]"]
     opacity = "Number(app.graphicsDevice.canvas.style.opacity)"
     steps = [
-        READY, ["until", f"{opacity} === 1"], eye, ["hold", 60, 60, 300, 0], ["until", f"{opacity} < 1"], eye,
-        ["evaluate", opacity], ["release", 360, 60], ["until", f"{opacity} === 1"], eye,
+        READY,
+        ["until", f"{opacity} === 1"],
+        eye,
+        ["hold", 60, 60, 300, 0],
+        ["until", f"{opacity} < 1"],
+        eye,
+        ["evaluate", opacity],
+        ["release", 360, 60],
+        ["until", f"{opacity} === 1"],
+        eye,
         ["evaluate", "[...stream.resource.background, camera.camera.clearColor.r]"],
-    ]  # fmt: skip
+    ]
     with page(tmp_path, packets_of(0, 0.0)) as url:
         results = in_browser([["go", url], *steps], tmp_path, size=(400, 300))
     before, held, faded, back, (*background, red) = (results[i] for i in (3, 6, 7, 10, 11))

@@ -3,6 +3,7 @@
 #   make test            lint, types, import rules and all tests
 #   make check           the same with the quick tests alone: for every change, in a minute or two on two cores
 #   make docs            the reference pages that are made from the code, in docs/reference/
+#   make gallery         the demo's stream on a page, with what it costs beside it, in runs/gallery/: static files to host
 #   make dist            every distribution, as source archive and wheel, in dist/
 #   make PYTHON=python3.12 test    choose the interpreter .venv is made with
 #   make clean           remove .venv and what was built
@@ -27,7 +28,7 @@ checksum = $(firstword $(shell cat $(1) | cksum))
 INSTALLED := $(VENV)/.installed-$(call checksum,$(LISTS))
 BUILT := $(VENV)/.built-$(call checksum,$(NATIVE))
 
-.PHONY: demo test check docs dist setup clean
+.PHONY: demo test check docs gallery dist setup clean
 .DEFAULT_GOAL := demo
 
 demo: setup
@@ -55,6 +56,12 @@ test check: setup
 
 docs: setup
 	$(BIN)/python -m tools.reference
+
+gallery: $(DEMO_OUT)/stream.gss
+	$(BIN)/python -m tools.gallery $(DEMO_OUT) --out runs/gallery
+
+$(DEMO_OUT)/stream.gss:
+	@$(MAKE) --no-print-directory demo
 
 dist: setup
 	$(BIN)/python -m tools.dist --out dist

@@ -77,7 +77,10 @@ class Part(ABC):  # noqa: B024 - each kind adds what is abstract
         return self.denied
 
     def __setattr__(self, name: str, value: object) -> None:
-        raise AttributeError(f"{type(self).__name__} is frozen: state is passed in and returned, never kept ({name!r})")
+        raise AttributeError(
+            f"{type(self).__name__} is frozen and cannot keep {name!r}: state is passed in and returned. What needs "
+            "memory is a motion, by follow(), or a streaming_method"
+        )
 
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other) and self.config == other.config

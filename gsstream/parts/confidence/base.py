@@ -38,6 +38,9 @@ class ConfidenceEstimator(Part):
     Confidence travels as a logit z (p = sigmoid(z)): max-pooling and Gumbel-sigmoid commute with it, so nothing ever
     computes log(p / (1 - p)) and nothing overflows at p = 0 or 1. Logits are finite; identical consecutive frames give
     at most the estimator's declared floor; no ``.grad`` and no graph is left behind.
+
+    A confidence sees two frames and keeps nothing: what needs memory is a motion (``MotionPart.follow``) or a whole
+    method (``StreamingMethod``).
     """
 
     traits: ClassVar[ConfidenceTraits] = ConfidenceTraits()

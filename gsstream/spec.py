@@ -16,12 +16,15 @@ A plugin is a module named by an entry point of the group ``gsstream``::
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import pluggy
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic.dataclasses import dataclass
 
 from gsstream import API_VERSION
+from gsstream.core import versions
 from gsstream.core.kinds import PART_KINDS
 
 __all__ = [
@@ -46,10 +49,40 @@ hookspec = pluggy.HookspecMarker("gsstream")
 hookimpl = pluggy.HookimplMarker("gsstream")
 
 
-class ComponentSpec(BaseModel):
-    """One part, described without importing it."""
+_T = TypeVar("_T")
+_STRICT = ConfigDict(extra="forbid")
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+
+def _with_fields(cls: type[_T]) -> type[_T]:
+    """Add the fields and what they mean to the docstring of a declaration, which is what ``help`` shows."""
+    said = (f"    {field.name}: {field.default.description}" for field in fields(cls))  # type: ignore[arg-type, union-attr]
+    cls.__doc__ = f"{cls.__doc__}\n\nArguments:\n" + "\n".join(said)
+    return cls
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class _Declaration:
+    """What the declarations have in common: one that cannot be read and has another version is refused for that."""
+
+    if not TYPE_CHECKING:
+
+        @model_validator(mode="wrap")
+        @classmethod
+        def _version_first(cls, given: Any, read: ModelWrapValidatorHandler[Any]) -> Any:
+            try:
+                return read(given)
+            except ValidationError:
+                said = getattr(given, "kwargs", None) or {}
+                problem = versions.version_problem("component API", str(said.get("api", API_VERSION)), API_VERSION)
+                if problem is None:
+                    raise
+                raise ValueError(f"{said.get('name', cls.__name__)}: {problem}") from None
+
+
+@_with_fields
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class ComponentSpec(_Declaration):
+    """One part, described without importing it."""
 
     kind: Kind = Field(description="which slot the part fits")
     name: str = Field(pattern=r"^[a-z][a-z0-9_-]*$", description="name used in recipes and on the command line")
@@ -58,10 +91,10 @@ class ComponentSpec(BaseModel):
     api: str = Field(default=API_VERSION, pattern=r"^\d+\.\d+$", description="plugin interface it was written for")
 
 
-class MethodSpec(BaseModel):
+@_with_fields
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class MethodSpec(_Declaration):
     """A named method: a recipe shipped as data inside a package."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_-]*$", description="name used by --method")
     recipe: str = Field(pattern=r"^[\w.]+:[\w./-]+$", description="'package:path/inside/it.yaml'")
@@ -69,10 +102,10 @@ class MethodSpec(BaseModel):
     api: str = Field(default=API_VERSION, pattern=r"^\d+\.\d+$", description="plugin interface it was written for")
 
 
-class CommandSpec(BaseModel):
+@_with_fields
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class CommandSpec(_Declaration):
     """A command of ``gsstream``, described without importing it."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str = Field(pattern=r"^[a-z][a-z0-9-]*$", description="what is typed after 'gsstream'")
     target: str = Field(

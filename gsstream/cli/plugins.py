@@ -11,8 +11,6 @@ from gsstream.cli.listing import plural, table
 from gsstream.core.errors import GsstreamError, PluginUnavailable, UnknownName
 
 if TYPE_CHECKING:
-    from pydantic import BaseModel
-
     from gsstream.discovery.catalog import Catalog, Entry
 
 
@@ -133,9 +131,11 @@ def _users(catalog: Catalog, kind: str, name: str) -> Iterator[tuple[str, str, s
             yield method, ".".join(path[2:]), repr(value), origin.label
 
 
-def setting_rows(config: type[BaseModel]) -> Iterator[tuple[str, ...]]:
+def setting_rows(config: type[Any]) -> Iterator[tuple[str, ...]]:
     """Return (key, type with bounds, default, meaning) of every setting; nested ones have dotted keys."""
-    yield from _fields(config.model_json_schema(), "")
+    from pydantic import TypeAdapter
+
+    yield from _fields(TypeAdapter(config).json_schema(), "")
 
 
 def _fields(schema: dict[str, Any], prefix: str, root: dict[str, Any] | None = None) -> Iterator[tuple[str, ...]]:

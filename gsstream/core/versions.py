@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import re
 
-#: Cure for plugins and files that were written for an older major version.
-NEWER_PLUGIN = "ask its author for a newer version"
+from gsstream.core.install_hints import page
+
+#: The page that says what became of the kinds and names of older interfaces.
+MIGRATE = "howto/migrate.md"
+#: Cure for files that were written for an older major version.
 NEWER_RECIPE = "write its keys as 'gsstream recipe METHOD' shows them, and set schema_version to that number"
 
 
-def version_problem(what: str, written: str, spoken: str, cure: str = NEWER_PLUGIN) -> str | None:
-    """Return why a ``what`` written for another "major.minor" cannot be used here, and ``cure``; None: it can."""
+def newer_plugin() -> str:
+    """Return the cure for plugins that were written for an older major version, whoever reads it."""
+    return f"ask its author for a newer version; if you are, {page(MIGRATE)} says what became of what"
+
+
+def version_problem(what: str, written: str, spoken: str, cure: str | None = None) -> str | None:
+    """Return why a ``what`` written for another "major.minor" cannot be used here, and a cure; None: it can.
+
+    The cure of one that is too old is ``cure``, else that of plugins.
+    """
     match = re.fullmatch(r"(\d+)\.(\d+)", written)
     if match is None:
         return f"{what} version is {written!r}; expected 'major.minor', e.g. {spoken!r}"
@@ -19,5 +30,5 @@ def version_problem(what: str, written: str, spoken: str, cure: str = NEWER_PLUG
     if (major, minor) > (own_major, own_minor):
         return f"built for {what} {written}, this gsstream speaks {spoken}: upgrade gsstream"
     if major < own_major:
-        return f"built for {what} {written}, this gsstream speaks {spoken}: {cure}"
+        return f"built for {what} {written}, this gsstream speaks {spoken}: {cure or newer_plugin()}"
     return None

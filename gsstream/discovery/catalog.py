@@ -13,7 +13,7 @@ from typing import Any
 from gsstream.core.errors import PluginUnavailable, UnknownName
 from gsstream.core.install_hints import install_part
 from gsstream.core.kinds import PART_KINDS
-from gsstream.discovery.discovery import Discovered, PluginFault, Spec, discover, spec_key
+from gsstream.discovery.discovery import Discovered, PluginFault, Spec, discover, moved, spec_key
 from gsstream.spec import CommandSpec, ComponentSpec, MethodSpec
 
 
@@ -80,7 +80,7 @@ class Catalog:
         try:
             return _load_target(entry.spec)
         except (Exception, SystemExit) as error:  # third-party code: any failure is reported with its owner's name
-            reason = str(error) if isinstance(error, PluginFault) else f"{type(error).__name__}: {error}"
+            reason = str(error) if isinstance(error, PluginFault) else f"{type(error).__name__}: {error}{moved(error)}"
             raise PluginUnavailable(f"{kind} {name!r} (from {entry.origin}) cannot be used: {reason}") from error
 
     def recipe_path(self, method: str) -> Path:

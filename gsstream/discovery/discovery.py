@@ -23,7 +23,8 @@ import pydantic
 
 from gsstream import API_VERSION, __version__
 from gsstream.core.errors import PluginUnavailable, suggest
-from gsstream.core.versions import version_problem
+from gsstream.core.install_hints import page
+from gsstream.core.versions import MIGRATE, version_problem
 from gsstream.discovery import builtin, hookspecs
 from gsstream.discovery.outputs import kept_outputs
 from gsstream.spec import ENTRY_POINT_GROUP, CommandSpec, ComponentSpec, MethodSpec
@@ -62,7 +63,8 @@ class Discovered:
         if self.error is None:
             return ""
         text = textwrap.shorten(_message(self.error) or "no message", 400, placeholder=" ...")
-        return text if isinstance(self.error, PluginFault) else f"{type(self.error).__name__}: {text}"
+        own = isinstance(self.error, PluginFault | pydantic.ValidationError)
+        return text if own else f"{type(self.error).__name__}: {text}"
 
     def unavailable(self, what: str) -> PluginUnavailable:
         """Return the error for a request of a part of this quarantined plugin; raise it from ``error``."""
@@ -139,12 +141,28 @@ def _warn_slow(name: str, distribution: str) -> None:
 def _message(error: BaseException) -> str:
     """Return the text of an error in printable characters; the ``__str__`` of a plugin's error may raise, too."""
     if isinstance(error, pydantic.ValidationError):
-        wrong = (f"{'.'.join(map(str, w['loc']))}: {w['msg']}, got {w['input']!r}" for w in error.errors())
-        return f"{error.title} of component API {API_VERSION}: {'; '.join(wrong)}"
+        return _refusal(error)
     try:
-        return str(error).encode("utf-8", "backslashreplace").decode()
+        return str(error).encode("utf-8", "backslashreplace").decode() + moved(error)
     except Exception as failure:
         return f"its message cannot be read: {type(failure).__name__}"
+
+
+def _refusal(error: pydantic.ValidationError) -> str:
+    """Return what is wrong with a declaration: its version, where that is the reason, else each of its fields."""
+    wrong = error.errors()
+    version = [str(w["ctx"]["error"]) for w in wrong if w["type"] == "value_error" and not w["loc"]]
+    if version:
+        return version[0]
+    said = "; ".join(f"{'.'.join(map(str, w['loc']))}: {w['msg']}, got {w['input']!r}" for w in wrong)
+    older = f"; of older kinds: {page(MIGRATE)}" if any(w["loc"] == ("kind",) for w in wrong) else ""
+    return f"{error.title} of component API {API_VERSION}: {said}{older}"
+
+
+def moved(error: BaseException) -> str:
+    """Name the page of what became of what, after an error about a name that gsstream does not have; else nothing."""
+    ours = isinstance(error, ImportError) and (error.name or "").partition(".")[0] == "gsstream"
+    return f"; if it was written for an older interface: {page(MIGRATE)}" if ours else ""
 
 
 def _collect(module: ModuleType, declared: list[Spec]) -> None:

@@ -133,3 +133,17 @@ def test_the_page_does_what_it_says(page: str, plugin: str, tmp_path: Path) -> N
     follow(DOCS / page, tmp_path)
     result = python(tmp_path / "site", "-m", "pytest", "-q", "-p", "no:cacheprovider", plugin, cwd=tmp_path)
     assert result.returncode == 0, result.stdout
+
+
+def test_a_recipe_with_a_name_is_a_method(tmp_path: Path) -> None:
+    page = (HOWTOS / "name-a-method.md").read_text(encoding="utf-8")
+    for language, name, text in re.findall(r"^```(\w+)\n# (\S+)\n(.*?)^```$", page, re.MULTILINE | re.DOTALL):
+        assert Path(name).suffix == {"toml": ".toml", "python": ".py", "yaml": ".yaml"}[language]
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    commands = [block for language, block in BLOCK.findall(page) if language == "console"]
+    assert len(commands) == 1
+    execute(commands[0], tmp_path, tmp_path / "site")
+    shown = gsstream(tmp_path / "site", "methods", "mine", cwd=tmp_path).stdout
+    assert "rigid motion, then every Gaussian" in shown
+    assert "stream.epochs" in shown

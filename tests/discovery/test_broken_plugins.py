@@ -6,6 +6,9 @@ import re
 
 import pytest
 
+from gsstream.core.install_hints import page
+
+MIGRATE = page("howto/migrate.md")
 REASONS = {
     "raises_at_import": "ModuleNotFoundError: No module named 'a_package_nobody_has'",
     "exits_at_import": "SystemExit: no licence found",
@@ -13,16 +16,19 @@ REASONS = {
     "other_major": "from-the-future: built for component API 4.0, this gsstream speaks 3.0: upgrade gsstream",
     "newer_minor": "newer-gate: built for component API 3.3, this gsstream speaks 3.0: upgrade gsstream",
     "older_major": "from-the-past: built for component API 1.0, this gsstream speaks 3.0: ask its author for a "
-    "newer version",
+    f"newer version; if you are, {MIGRATE} says what became of what",
+    "renamed_kind": "hicom: built for component API 1.0, this gsstream speaks 3.0: ask its author for a "
+    f"newer version; if you are, {MIGRATE} says what became of what",
+    "old_name": "ImportError: cannot import name 'GateState' from 'gsstream.api' ",
     "duplicate_name": "declares the gate 'always-open', which gsstream 0.1.0 already provides; rename it",
     "unknown_hook": "implements the hook 'gsstream_component', which this gsstream does not know; did you mean "
     "'gsstream_components'?",
     "wrong_arguments": "PluginValidationError: Plugin 'gsstream_wrong_arguments_plugin' for hook 'gsstream_components' "
     "hookimpl definition: gsstream_components(registry) Argument(s) {'registry'} are declared in the hookimpl but ",
     "wrong_return": "gsstream_components() returned a str in its list; expected ComponentSpec",
-    "bad_spec": "ValidationError: ComponentSpec of component API 3.0: kind: Input should be 'structure', 'confidence', "
+    "bad_spec": "ComponentSpec of component API 3.0: kind: Input should be 'structure', 'confidence', "
     "'propagation', 'gate', 'motion', 'update', 'growth', 'regularizer', 'streaming_method', 'renderer' "
-    "or 'source', got 'gatte'",
+    f"or 'source', got 'gatte'; of older kinds: {MIGRATE}",
     "command_clash": "declares the command 'run', which gsstream 0.1.0 already provides; rename it",
     "closes_stdout": "it closed stdout while it was loaded; what it closed is open again",
     "closes_numbers": "it closed stdout and stderr while it was loaded; what it closed is open again",
@@ -42,6 +48,8 @@ def test_each_is_listed_with_its_reason_while_the_rest_works(lab) -> None:
         assert f"quarantined: {reason}" in line
         assert reason in methods.stderr
     assert listing.stdout.count("quarantined: ") == len(REASONS)
+    (old,) = [line for line in listing.stdout.splitlines() if line.startswith("old_name ")]
+    assert old.endswith(f"; if it was written for an older interface: {MIGRATE}")
     assert "always-open" in listing.stdout
     assert methods.stdout.splitlines()[1].startswith("dense")
     assert lab.cli("recipe", "dense").returncode == 0

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import pydoc
+from dataclasses import fields, replace
+
 import pytest
 
 from gsstream.core.errors import PluginUnavailable, UnknownName
+from gsstream.core.install_hints import page
 from gsstream.core.kinds import CONTRACTS
 from gsstream.core.versions import version_problem
 from gsstream.discovery.catalog import load_catalog
 from gsstream.discovery.discovery import Discovered, PluginFault, discover
-from gsstream.spec import ComponentSpec, MethodSpec
+from gsstream.spec import CommandSpec, ComponentSpec, MethodSpec
 
 
 @pytest.fixture
@@ -66,7 +70,12 @@ def test_unknown_names_offer_the_nearest(builtin) -> None:
         ("1.3", "1.1", "built for component API 1.3, this gsstream speaks 1.1: upgrade gsstream"),
         ("1.10", "1.9", "built for component API 1.10, this gsstream speaks 1.9: upgrade gsstream"),
         ("2.0", "1.9", "built for component API 2.0, this gsstream speaks 1.9: upgrade gsstream"),
-        ("1.9", "2.0", "built for component API 1.9, this gsstream speaks 2.0: ask its author for a newer version"),
+        (
+            "1.9",
+            "2.0",
+            "built for component API 1.9, this gsstream speaks 2.0: ask its author for a newer version; if you are, "
+            f"{page('howto/migrate.md')} says what became of what",
+        ),
         ("one", "1.0", "component API version is 'one'; expected 'major.minor', e.g. '1.0'"),
     ],
 )
@@ -92,7 +101,7 @@ def test_a_name_declared_twice_quarantines_the_second_plugin_as_a_whole() -> Non
 
 
 def test_the_same_name_in_two_kinds_is_fine() -> None:
-    both = (spec("x"), spec("x").model_copy(update={"kind": "structure"}))
+    both = (spec("x"), replace(spec("x"), kind="structure"))
     assert not load_catalog([Discovered("a", "gsstream-a", "1", both)]).quarantine
 
 
@@ -101,3 +110,13 @@ def test_discovery_starts_with_the_built_in_parts(monkeypatch: pytest.MonkeyPatc
     found = discover()
     assert found[0].name == "builtin"
     assert all(plugin.left_out for plugin in found[1:])
+
+
+@pytest.mark.parametrize("declared", [ComponentSpec, MethodSpec, CommandSpec])
+def test_help_on_a_declaration_says_what_its_fields_mean_and_little_else(declared: type) -> None:
+    said = pydoc.plain(pydoc.render_doc(declared)).splitlines()
+    for field in fields(declared):
+        (line,) = [line for line in said if line.strip(" |").startswith(f"{field.name}: ")]
+        assert len(line.split(": ", 1)[1]) > 8
+        assert said.index(line) < 20
+    assert len(said) < 120, "hundreds of lines of the base class would hide them"

@@ -21,6 +21,7 @@ from pydantic import BaseModel, ValidationError
 from gsstream.core.errors import InputError
 from gsstream.core.kinds import CONTRACTS
 from gsstream.core.part import Part
+from gsstream.engine.assembly.guard import line_of
 from gsstream.parts.gate.base import GateSampler
 from gsstream.testing import device as device
 from gsstream.testing.cases import EXTREMES, World, fingerprint, get_case
@@ -200,7 +201,8 @@ def check_extremes(part: Part) -> None:
         try:
             found = outputs(part, get_case(name))
         except Exception as error:
-            raise AssertionError(f"world {name!r}: raised {type(error).__name__}: {error}") from error
+            said = error if isinstance(error, AssertionError) else f"raised {type(error).__name__}: {error}"
+            raise AssertionError(f"world {name!r}: {said}{line_of(error, part)}") from error
         for output, value in found.items():
             if value.dtype.is_floating_point:
                 finite(f"world {name!r}: {output}", value)

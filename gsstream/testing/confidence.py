@@ -10,7 +10,7 @@ import torch
 from gsstream.parts.confidence.base import ConfidenceEstimator
 from gsstream.testing.cases import EXTREMES, World, get_case
 from gsstream.testing.compare import at_most, equal, finite
-from gsstream.testing.drive import Behaviour, Outputs, Poison, poisons_of
+from gsstream.testing.drive import Behaviour, Outputs, Poison, has_shape, poisons_of
 from gsstream.testing.registry import check
 
 ENOUGH_AUC = 0.9
@@ -23,7 +23,7 @@ def check_confidence_range(part: ConfidenceEstimator) -> None:
         case = get_case(name)
         got = part.estimate(case)
         n = len(case.gaussians)
-        assert tuple(got.shape) == (n,), f"world {name!r}: expected shape [{n}], got {list(got.shape)}"
+        has_shape(f"world {name!r}", got, (n,))
         assert got.dtype == torch.float32, f"world {name!r}: expected float32, got {got.dtype}"
         finite(f"world {name!r}", got)
 
@@ -159,4 +159,6 @@ POISONS = (
     Poison("a pixel of view 1 of the frame before", "view 1", _in_frame_before),
     *poisons_of(*(f"gaussians.{name}" for name in ("means", "quats", "scales", "opacities", "sh0"))),
 )
-BEHAVIOUR = Behaviour(outputs, POISONS, keeps_precision=False, by_gaussian=True)
+BEHAVIOUR = Behaviour(
+    outputs, POISONS, keeps_precision=False, by_gaussian=True, shape=lambda world: (len(world.gaussians),)
+)

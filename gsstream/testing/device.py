@@ -10,17 +10,22 @@ import torch
 from gsstream.core.context import RowGradient, ScreenGradient
 from gsstream.core.deferred import deferred_checks
 from gsstream.core.part import Part
+from gsstream.engine.assembly.guard import line_of
 from gsstream.parts.render.backward import backward
 from gsstream.testing.cases import World, get_case
 from gsstream.testing.compare import all_equal
 from gsstream.testing.drive import Outputs, outputs
-from gsstream.testing.pretend import DEVICE, PretendDevice, PretendUnavailable, require_pretend
+from gsstream.testing.pretend import DEVICE, DeviceMismatch, PretendDevice, PretendUnavailable, require_pretend
 from gsstream.testing.registry import Skip, check, kind_of
 
 #: Kinds whose tensors are on the device of the run. The first two are called once a frame: they may wait for a value,
 #: and bring noise from the processor's generator. The others are called in every iteration, and may do neither.
 KINDS = ("confidence", "propagation", "gate", "regularizer")
 PER_ITERATION = KINDS[2:]
+CURE = (
+    "make tensors from those that are given (torch.zeros_like, new_full); arrays of context.cameras are numpy: "
+    "torch.as_tensor(array).to(means)"
+)
 WHY = "the same operations, in another order of sums at most"
 
 
@@ -74,8 +79,11 @@ def check_device(part: Part) -> None:
             there = on_device(world)
             for crossed in (log.up, log.down, log.waits):
                 crossed.clear()
-            with deferred_checks():
-                found = _with_gradients(part, there, per_iteration)
+            try:
+                with deferred_checks():
+                    found = _with_gradients(part, there, per_iteration)
+            except DeviceMismatch as error:
+                raise AssertionError(f"{error}{line_of(error, part)}; {CURE}") from error
             _look(log, per_iteration)
             for output, value in found.items():
                 assert value.device == DEVICE, f"{output}: expected the device of the inputs, got {value.device}"

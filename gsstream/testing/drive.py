@@ -41,6 +41,8 @@ class Behaviour:
     #: Outputs whose names begin so are not compared after a permutation: the kind has a check of its own.
     no_order: str | None = None
     hands_on: bool = False  # may hand on a value that is not finite, because it shows in the loss
+    #: The shape that the engine expects of every output on a world; None: they differ, and checks of the kind look.
+    shape: Callable[[World], tuple[int, ...]] | None = None
 
 
 def behaviour_of(part: Part) -> Behaviour:
@@ -50,8 +52,18 @@ def behaviour_of(part: Part) -> Behaviour:
 
 
 def outputs(part: Part, world: World) -> Outputs:
-    """Return the outputs of ``part`` on a world, tensor by tensor."""
-    return behaviour_of(part).outputs(part, world)
+    """Return the outputs of ``part`` on a world, tensor by tensor. Raises AssertionError for one of another shape."""
+    behaviour = behaviour_of(part)
+    found = behaviour.outputs(part, world)
+    if behaviour.shape is not None:
+        for name, value in found.items():
+            has_shape(name, value, behaviour.shape(world))
+    return found
+
+
+def has_shape(what: str, value: torch.Tensor, want: tuple[int, ...]) -> None:
+    """Raise AssertionError unless the shape is what is wanted, in the words in which a run refuses it."""
+    assert tuple(value.shape) == want, f"{what}: expected shape {list(want)}, got {list(value.shape)}"
 
 
 def draw(part: GateSampler, number: int, seed: int = 7) -> torch.Tensor | None:

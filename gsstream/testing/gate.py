@@ -9,7 +9,7 @@ import torch
 from gsstream.parts.gate.base import AnalyticGate, GateSampler
 from gsstream.testing.cases import World, get_case
 from gsstream.testing.compare import ROUNDING, all_equal, at_most, equal, finite
-from gsstream.testing.drive import Behaviour, Outputs, draw, poisons_of
+from gsstream.testing.drive import Behaviour, Outputs, draw, has_shape, poisons_of
 from gsstream.testing.registry import check
 
 DRAWS = 4096
@@ -21,10 +21,16 @@ def _spread() -> torch.Tensor:
     return torch.linspace(-6, 6, 241)
 
 
+def _sample(part: GateSampler, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
+    gates = part.sample(logits, noise)
+    has_shape("sample()", gates, tuple(logits.shape))
+    return gates
+
+
 def _samples(part: GateSampler, logits: torch.Tensor) -> list[tuple[str, torch.Tensor]]:
     noise = draw(part, len(logits))
-    drawn = [] if noise is None else [("with noise", part.sample(logits, noise))]
-    return [("without noise", part.sample(logits, None)), *drawn]
+    drawn = [] if noise is None else [("with noise", _sample(part, logits, noise))]
+    return [("without noise", _sample(part, logits, None)), *drawn]
 
 
 @check("gate")
@@ -56,7 +62,7 @@ def check_gate_calibration(part: GateSampler) -> None:
     for p in PROBABILITIES:
         logits = part.init(torch.logit(torch.tensor(p)).expand(DRAWS).clone())
         expected = float(part.open_probability(logits)[0])
-        got = float((part.sample(logits, draw(part, DRAWS)) > 0).float().mean())
+        got = float((_sample(part, logits, draw(part, DRAWS)) > 0).float().mean())
         sigma = max(expected * (1 - expected), 1 / DRAWS) ** 0.5 / DRAWS**0.5
         assert abs(got - expected) <= 4 * sigma, (
             f"confidence {p}: expected a share of {expected:.4f} open gates, got {got:.4f}; "
@@ -68,7 +74,7 @@ def check_gate_calibration(part: GateSampler) -> None:
 def check_gate_stochastic(part: GateSampler) -> None:
     """With noise, gates vary from draw to draw."""
     logits = part.init(torch.zeros(256))
-    first, second = (part.sample(logits, draw(part, 256, seed)) for seed in (1, 2))
+    first, second = (_sample(part, logits, draw(part, 256, seed)) for seed in (1, 2))
     differ = int((first != second).sum())
     assert differ > 0, "gates of confidence 0.5 are the same in two draws of 256: the noise has no effect"
 
@@ -80,9 +86,9 @@ def check_gate_noise_is_data(part: GateSampler) -> None:
     noise = draw(part, len(logits))
     assert noise is not None, "claims to be stochastic, but noise is None"
     order = torch.randperm(len(noise), generator=torch.Generator().manual_seed(9))
-    gates = part.sample(logits, noise)
-    equal("the same noise again", part.sample(logits, noise), gates)
-    equal("permuted rows and noise", part.sample(logits[order], noise[order]), gates[order])
+    gates = _sample(part, logits, noise)
+    equal("the same noise again", _sample(part, logits, noise), gates)
+    equal("permuted rows and noise", _sample(part, logits[order], noise[order]), gates[order])
     many = draw(part, 65536)
     assert many is not None
     finite("65536 draws", many)
@@ -119,7 +125,7 @@ def check_gate_extremes(part: GateSampler) -> None:
         for start in (part.init(ends), ends):
             logits = start.detach().clone().requires_grad_(True)
             finite(f"open probability at +-{far:g}", part.open_probability(logits))
-            opened = float(part.sample(logits, None)[1].detach())
+            opened = float(_sample(part, logits, None)[1].detach())
             assert opened == 1.0, f"logit {far:g}: expected a gate of exactly 1.0, got {opened!r}"
             for how, gates in _samples(part, logits):
                 finite(f"gates {how} at +-{far:g}", gates)
@@ -146,8 +152,8 @@ def check_gate_deterministic_is_final(part: GateSampler) -> None:
     """The transmitted gate, sample(logits, None), does not depend on gradients being recorded."""
     logits = part.init(_spread()).detach()
     with torch.no_grad():
-        quiet = part.sample(logits, None)
-    recorded = part.sample(logits.clone().requires_grad_(True), None).detach()
+        quiet = _sample(part, logits, None)
+    recorded = _sample(part, logits.clone().requires_grad_(True), None).detach()
     equal("gates with gradients recorded", recorded, quiet)
 
 
@@ -183,7 +189,7 @@ def check_gate_form(part: GateSampler) -> None:
     seed = torch.Generator().manual_seed(1)
     assert part.noise(len(logits), seed) is None, "form(): expected a gate without noise, got one that draws some"
     assert part.num_levels == form.levels, f"form(): expected {part.num_levels} levels, got {form.levels}"
-    pairs = ((part.sample(logits, None), form.gates), (part.open_probability(logits), form.probability))
+    pairs = ((_sample(part, logits, None), form.gates), (part.open_probability(logits), form.probability))
     for name, (value, formula) in zip(("gates", "open probability"), pairs, strict=True):
         grad = torch.autograd.grad(value.sum(), logits)[0] if value.requires_grad else torch.zeros_like(logits)
         stated, derivative = formula(logits.detach())
@@ -196,7 +202,7 @@ def check_gate_form(part: GateSampler) -> None:
 def outputs(part: GateSampler, world: World) -> Outputs:
     """Return logits, gates and probabilities; every Gaussian has a gate of its own here."""
     logits = part.init(world.logits)
-    noise = draw(part, len(world.logits))
+    noise = draw(part, len(logits))
     found = {
         "init()": logits,
         "sample(None)": part.sample(logits, None),
@@ -207,4 +213,10 @@ def outputs(part: GateSampler, world: World) -> Outputs:
 
 
 #: The noise stays in place when Gaussians are permuted: check_gate_noise_is_data permutes it too.
-BEHAVIOUR = Behaviour(outputs, poisons_of("logits", usual=(12.0, -12.0)), by_gaussian=True, no_order="sample(noise)")
+BEHAVIOUR = Behaviour(
+    outputs,
+    poisons_of("logits", usual=(12.0, -12.0)),
+    by_gaussian=True,
+    no_order="sample(noise)",
+    shape=lambda world: tuple(world.logits.shape),
+)

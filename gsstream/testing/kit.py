@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from gsstream.core.kinds import PART_KINDS
 from gsstream.core.part import Part
+from gsstream.engine.assembly.guard import line_of
 from gsstream.method.base import StreamingMethod
 from gsstream.spec import CommandSpec
 from gsstream.testing import method_driver
@@ -44,7 +45,7 @@ class CheckResult:
 
 def run_check(entry: Check, subject: Any, expected: str | None = None) -> CheckResult:
     """Make one check on a subject; ``expected`` says why it must fail (None: it must pass)."""
-    name = repr(subject)
+    name, part = repr(subject), subject
     try:
         if entry.trait is not None and not claimed(subject, entry.trait):
             missing = f"not claimed: {type(subject.claims()).__name__}.{entry.trait}"
@@ -61,7 +62,7 @@ def run_check(entry: Check, subject: Any, expected: str | None = None) -> CheckR
         return CheckResult(entry.name, name, status, str(error) if expected is None else f"{expected} ({error})")
     except Exception as error:  # a part may raise anything; that is what is being found out
         status = "failed" if expected is None else "expected failure"
-        raised = f"raised {type(error).__name__}: {error}"
+        raised = f"raised {type(error).__name__}: {error}{line_of(error, part)}"
         return CheckResult(entry.name, name, status, raised if expected is None else f"{expected} ({raised})")
     if expected is not None:
         return CheckResult(entry.name, name, "failed", f"passed, but was expected to fail: {expected}; drop the entry")

@@ -135,4 +135,6 @@ def outputs(part: Propagation, world: World) -> Outputs:
     return {"propagate()": part.propagate(world.logits, world.hierarchy)}
 
 
-BEHAVIOUR = Behaviour(outputs, poisons_of("logits", usual=(12.0, -12.0)))
+BEHAVIOUR = Behaviour(
+    outputs, poisons_of("logits", usual=(12.0, -12.0)), shape=lambda world: (world.hierarchy.num_nodes,)
+)

@@ -53,14 +53,14 @@ def error_context(slot: str, part: object, where: Where) -> Iterator[None]:
             raise fault(str(error), slot, part, where) from error
         raise
     except Exception as error:
-        raise fault(f"{type(error).__name__}: {error}{_line_of(error, part)}", slot, part, where) from error
+        raise fault(f"{type(error).__name__}: {error}{line_of(error, part)}", slot, part, where) from error
 
 
 def _as_fault(slot: str, part: object, where: Where, error: Exception) -> Exception:
     return error if isinstance(error, ComponentError) else fault(str(error), slot, part, where)
 
 
-def _line_of(error: Exception, part: object) -> str:
+def line_of(error: Exception, part: object) -> str:
     """The line of the part's own package that was being run, as `` (gate.py:42)``."""
     package = type(part).__module__.partition(".")[0]
     found = ""

@@ -21,7 +21,7 @@ import typer
 from gsstream import API_VERSION, __version__
 from gsstream.cli.listing import plural, printable
 from gsstream.core.errors import GsstreamError
-from gsstream.core.install_hints import install_extra
+from gsstream.core.install_hints import WHERE_DIST, install_any
 from gsstream.core.processors import processors
 
 if TYPE_CHECKING:
@@ -29,6 +29,10 @@ if TYPE_CHECKING:
 
 #: Instruction sets that the kernels use where a processor has them, by the names that Linux gives them.
 _FLAGS = ("sse4_2", "avx2", "fma", "avx512f", "asimd")
+#: Heading of the line that says how what is missing is installed.
+INSTALL = "to install"
+#: Packages that an extra lacks, by name; the others are counted.
+_NAMED = 3
 #: Levels of 255 by which two renderers may differ in one pixel.
 _LEVELS = 2
 
@@ -49,8 +53,8 @@ def doctor() -> None:
     _say("encodes with", _encoder())
     _say("GPU", _gpu())
     _say("plugins", _plugins())
-    for extra, said in _extras():
-        _say(f"extra {extra}", said)
+    for heading, said in _extras():
+        _say(heading, said)
     sound, said = _self_test(renderer)
     _say("self-test", said)
     if not sound:
@@ -58,7 +62,8 @@ def doctor() -> None:
 
 
 def _say(what: str, text: str) -> None:
-    typer.echo(f"{what:<13} {printable(text)}")
+    # What DIST is stands in the last line of the extras, once.
+    typer.echo(f"{what:<13} {printable(text if what == INSTALL else text.replace(WHERE_DIST, ''))}")
 
 
 def _processor() -> str:
@@ -100,7 +105,7 @@ def _instructions(name: str) -> str:
 def _torch() -> str:
     """Imports it: only that shows whether it works."""
     if importlib.util.find_spec("torch") is None:
-        return f"not installed; only encoding needs it: {install_extra('s2gs')}"
+        return "not installed; only encoding needs it (extra encoder or s2gs)"
     start = time.perf_counter()
     try:
         import torch
@@ -157,16 +162,24 @@ def _plugins() -> str:
 
 
 def _extras() -> Iterator[tuple[str, str]]:
-    """Yield each extra of gsstream but the developer's, and its packages that are not installed."""
+    """Yield (heading, text): the extras of gsstream that are whole, what each of the others lacks, how to install it.
+
+    The developer's extra is left out.
+    """
     about = importlib.metadata.metadata("gsstream")
     wanted: dict[str, list[str]] = {extra: [] for extra in about.get_all("Provides-Extra") or () if extra != "dev"}
     for line in importlib.metadata.requires("gsstream") or ():
         requirement, _, marker = line.partition(";")
         for extra in re.findall(r"""extra\s*==\s*["']([^"']+)["']""", marker):
             wanted.get(extra, []).append(requirement)
-    for extra in wanted:
-        missing = sorted(set(_missing(extra, wanted)))
-        yield extra, f"{', '.join(missing)} missing: {install_extra(extra)}" if missing else "present"
+    lacking = {extra: sorted(set(_missing(extra, wanted))) for extra in wanted}
+    yield "extras", f"present: {', '.join(extra for extra in wanted if not lacking[extra]) or 'none'}"
+    for extra, missing in lacking.items():
+        if missing:
+            more = f" and {len(missing) - _NAMED} more" if len(missing) > _NAMED else ""
+            yield f"extra {extra}", f"{', '.join(missing[:_NAMED])}{more} missing"
+    if any(lacking.values()):
+        yield INSTALL, install_any()
 
 
 def _missing(extra: str, wanted: dict[str, list[str]]) -> Iterator[str]:

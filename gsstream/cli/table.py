@@ -9,6 +9,8 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
+from gsstream.core.errors import PluginUnavailable
+from gsstream.core.install_hints import install_part
 from gsstream.discovery.builtin import gsstream_commands
 from gsstream.discovery.catalog import Catalog, Entry, load_catalog
 from gsstream.discovery.commands import command_of
@@ -22,7 +24,7 @@ class CommandTable(TyperGroup):
     """A group whose commands come from declarations (:class:`gsstream.spec.CommandSpec`).
 
     gsstream's own commands are found without looking for plugins. A plugin that cannot be loaded costs its own commands
-    alone: they are missing here, and asking for one says why.
+    alone: they are missing here, and asking for one says why. So does asking for one that this project ships elsewhere.
     """
 
     def __init__(self, **settings: Any) -> None:
@@ -46,7 +48,7 @@ class CommandTable(TyperGroup):
         elif (spec := self._others().get(cmd_name)) is not None:
             found = command_of(spec, self._plugins())
         else:
-            self._say_what_is_broken(cmd_name)
+            self._say_what_is_missing(cmd_name)
             return None
         self.commands[cmd_name] = found
         return found
@@ -79,10 +81,13 @@ class CommandTable(TyperGroup):
     def _others(self) -> dict[str, CommandSpec]:
         return {spec.name: spec for spec in _specs(self._plugins()) if spec.name not in self._own}
 
-    def _say_what_is_broken(self, name: str) -> None:
+    def _say_what_is_missing(self, name: str) -> None:
         for plugin in self._plugins().quarantine:
             if any(isinstance(spec, CommandSpec) and spec.name == name for spec in plugin.declared):
                 raise plugin.unavailable(f"the command {name!r}") from plugin.error
+        cure = install_part("command", name)
+        if cure is not None and not any(plugin.left_out for plugin in self._plugins().plugins):
+            raise PluginUnavailable(f"the command {name!r} is not installed here. To install it: {cure}")
 
 
 def _specs(catalog: Catalog) -> Iterable[CommandSpec]:

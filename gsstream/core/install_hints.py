@@ -22,6 +22,13 @@ ENCODER = ("torch", "kornia", "scipy", "matplotlib")
 TABLE = Path(__file__).with_name("shipped.json")
 #: Whether a package index has gsstream and its plugins. Until one has, commands name sources, or a folder of wheels.
 ON_INDEX = False
+#: What DIST means in such a command.
+WHERE_DIST = ", where DIST is the folder of wheels that 'make dist' writes (no index has them yet)"
+#: What comes before a command that brings torch, where there is no GPU.
+CPU_FIRST = (
+    "there is no NVIDIA GPU here: install the CPU build of torch first, by the command that pytorch.org shows under "
+    "'Start Locally' for Linux, Pip, Python, CPU (the other is 4.7 GB more)"
+)
 #: The repository, where this is a checkout of it.
 SOURCES = Path(__file__).parents[2]
 #: The pages that messages name: in the repository, and in what is built from it.
@@ -42,36 +49,55 @@ def pip() -> str:
     return "pip" if found is not None and Path(found).parent == here.parent else f"{shlex.quote(str(here))} -m pip"
 
 
+def finds_gpu() -> bool:
+    """Say whether the driver of an NVIDIA GPU is here, without asking torch, which may be what is missing."""
+    return shutil.which("nvidia-smi") is not None or Path("/dev/nvidiactl").exists()
+
+
 def install(requirement: str) -> str:
     """Return the command that installs a requirement into the environment that runs now.
 
     Distributions of this project that are not installed yet come from the sources where these are at hand, else from
-    wheels, as long as no index has them.
+    wheels, as long as no index has them. Where torch would come with CUDA and there is no GPU for it, its CPU build
+    comes first.
     """
-    lacking = [] if ON_INDEX else [name for name in _own(requirement) if not _is_installed(name)]
+    brought = list(_brought(requirement))
+    first = f"{CPU_FIRST}, then: " if "torch" in brought and _would_bring_cuda() else ""
+    lacking = [] if ON_INDEX else [name for name in brought if name.startswith("gsstream-") and not _is_installed(name)]
     if not lacking:
-        return f"{pip()} install {shlex.quote(requirement)}"
+        return f"{first}{pip()} install {shlex.quote(requirement)}"
     if not (SOURCES / "plugins").is_dir():
-        return (
-            f"{pip()} install --find-links DIST {shlex.quote(requirement)}, where DIST is the folder of wheels that "
-            "'make dist' writes (no index has them yet)"
-        )
+        return f"{first}{pip()} install --find-links DIST {shlex.quote(requirement)}{WHERE_DIST}"
     folders = [requirement.replace("gsstream", str(SOURCES), 1)] if requirement.startswith("gsstream[") else []
     folders += [str(SOURCES / "plugins" / name.removeprefix("gsstream-").replace("-", "_")) for name in lacking]
-    return f"{pip()} install " + " ".join(f"-e {shlex.quote(folder)}" for folder in folders)
+    return f"{first}{pip()} install " + " ".join(f"-e {shlex.quote(folder)}" for folder in folders)
 
 
-def _own(requirement: str) -> Iterator[str]:
-    """Names and extras of this project's other distributions that a requirement brings, each once."""
+def install_any() -> str:
+    """Return the command that installs any extra, which it calls EXTRA, and what comes first on this machine."""
+    first = f"{CPU_FIRST}, then: " if _would_bring_cuda() else ""
+    if not ON_INDEX and (SOURCES / "requirements.txt").is_file():
+        return f"{first}{pip()} install -r {shlex.quote(str(SOURCES / 'requirements.txt'))}, which brings all of them"
+    links = "" if ON_INDEX else "--find-links DIST "
+    return f"{first}{pip()} install {links}'gsstream[EXTRA]'{'' if ON_INDEX else WHERE_DIST}"
+
+
+def _would_bring_cuda() -> bool:
+    """Say whether pip would bring torch as its CUDA build, which only Linux has, to a machine without a GPU."""
+    return sys.platform == "linux" and not _is_installed("torch") and not finds_gpu()
+
+
+def _brought(requirement: str) -> Iterator[str]:
+    """Yield the distributions that a requirement brings by name, those of the extras of gsstream each once."""
     if not requirement.startswith("gsstream["):
-        yield from [requirement] if requirement.startswith("gsstream-") else []
+        yield requirement
         return
     found: dict[str, None] = {}
     for extra in requirement.removeprefix("gsstream[").rstrip("]").split(","):
         for line in importlib.metadata.requires("gsstream") or ():
             name = re.match(r"[\w.-]+(\[[\w,-]+\])?", line)
             if name is not None and re.search(rf"extra\s*==\s*[\"']{extra}[\"']", line):
-                found.update(dict.fromkeys(_own(name.group())))
+                found.update(dict.fromkeys(_brought(name.group())))
     yield from found
 
 

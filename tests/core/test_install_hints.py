@@ -16,7 +16,7 @@ from packaging.requirements import Requirement
 
 from gsstream.cli.main import run_command
 from gsstream.core import install_hints
-from gsstream.core.install_hints import ENCODER, TABLE, install, install_part, install_renderer, page
+from gsstream.core.install_hints import ENCODER, TABLE, install, install_any, install_part, install_renderer, page
 from gsstream.discovery.catalog import load_catalog
 from tools.shipped import table
 
@@ -97,6 +97,41 @@ def test_what_no_index_has_comes_from_sources_or_wheels(monkeypatch: pytest.Monk
     assert "install --find-links DIST 'gsstream[s2gs]', where DIST is the folder of wheels" in install("gsstream[s2gs]")
     monkeypatch.setattr(install_hints, "ON_INDEX", True)
     assert install("gsstream[s2gs]").endswith("install 'gsstream[s2gs]'")
+
+
+@pytest.mark.parametrize("driver", [False, True])
+@pytest.mark.parametrize(
+    "requirement", ["gsstream[s2gs]", "gsstream[encoder]", "gsstream[methods,video]", "gsstream[video]"]
+)
+def test_without_a_gpu_the_cpu_build_of_torch_comes_first(
+    monkeypatch: pytest.MonkeyPatch, requirement: str, driver: bool
+) -> None:
+    monkeypatch.setattr(install_hints, "_is_installed", lambda name: name != "torch")
+    monkeypatch.setattr(install_hints, "finds_gpu", lambda: driver)
+    monkeypatch.setattr("sys.platform", "linux")
+    wanted = not driver and requirement != "gsstream[video]"
+    assert install(requirement).startswith("there is no NVIDIA GPU here: install the CPU build") == wanted
+    assert install(requirement).endswith(f"install '{requirement}'")
+    assert ("pytorch.org" in install_any()) == (not driver)
+    monkeypatch.setattr("sys.platform", "darwin")
+    assert "pytorch.org" not in install(requirement) + install_any()
+
+
+def test_commands_of_the_lab_are_known_where_it_is_missing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    commands = [key.removeprefix("command/") for keys in json.loads(TABLE.read_text()).values() for key in keys]
+    commands = [name for name in commands if "/" not in name]
+    alone = [plugin for plugin in load_catalog().plugins if plugin.name == "builtin"]
+    monkeypatch.setattr("gsstream.cli.table.load_catalog", lambda: load_catalog(alone))
+    assert len(commands) > 6
+    for name in commands:
+        assert run_command([name, "x"]) == 1
+        said = capsys.readouterr().err
+        assert said.startswith(f"error: the command {name!r} is not installed here. To install it: ")
+        assert said.rstrip().endswith("'gsstream[s2gs]'")
+    assert run_command(["compaer"]) == 2
+    assert "not installed" not in capsys.readouterr().err
 
 
 def test_pages_that_messages_name_are_there() -> None:

@@ -70,6 +70,7 @@ def compare(
     from gsstream.core.install_hints import require_encoder
     from gsstream.discovery.catalog import load_catalog
     from gsstream_lab.report.groups import read_sweep_data
+    from gsstream_lab.sweep.check import check_parts
     from gsstream_lab.sweep.compare import equal_epochs, equal_time, own_settings
     from gsstream_lab.sweep.drive import run_sweep
     from gsstream_lab.sweep.plan import make_plan
@@ -81,6 +82,7 @@ def compare(
     if equal.at == "epochs":
         config = equal_epochs(config, epochs, catalog)
     plan = make_plan(config, Path(), catalog.recipe_path)
+    check_parts(plan, catalog)
     result = run_sweep(plan, out, where.executor(), say=progress(quiet))
     if equal.at == "time":
         took = {one.variant: one.mean("cpu_seconds") for one in read_sweep_data(out).groups}

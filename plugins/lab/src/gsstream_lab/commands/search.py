@@ -43,6 +43,7 @@ def search(
     from gsstream.discovery.catalog import load_catalog
     from gsstream.engine.assembly.assemble import assemble
     from gsstream.recipe.load import resolve_recipe
+    from gsstream_lab.sweep.check import check_parts
     from gsstream_lab.sweep.plan import make_plan
     from gsstream_lab.sweep.search import SweepScore, climb, usual_ladders, value_of
     from gsstream_lab.sweep.tune import tuned_recipe
@@ -64,6 +65,8 @@ def search(
         executor=where.executor,
         say=progress(quiet),
     )
+    for key, values in ladders.items():
+        check_parts(make_plan(score.config(start, key, values), Path(), catalog.recipe_path), catalog)
     found = climb(start, ladders, score)
     key = next(iter(ladders))
     (point,) = make_plan(score.config(found, key, [found[key]]), Path(), catalog.recipe_path).points

@@ -41,11 +41,14 @@ def sweep(
     """
     from gsstream.core.install_hints import require_encoder
     from gsstream.discovery.catalog import load_catalog
+    from gsstream_lab.sweep.check import check_parts
     from gsstream_lab.sweep.config import read_sweep
     from gsstream_lab.sweep.plan import make_plan
 
     require_encoder()
-    plan = make_plan(read_sweep(config, scenes, split), config.parent, load_catalog().recipe_path)
+    catalog = load_catalog()
+    plan = make_plan(read_sweep(config, scenes, split), config.parent, catalog.recipe_path)
+    check_parts(plan, catalog)
     if dry_run:
         typer.echo(_describe(plan, out))
         return

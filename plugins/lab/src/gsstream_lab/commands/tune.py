@@ -54,6 +54,7 @@ def tune(
     from gsstream.discovery.catalog import load_catalog
     from gsstream.recipe.budget import budget_overrides
     from gsstream.recipe.load import resolve_recipe
+    from gsstream_lab.sweep.check import check_parts
     from gsstream_lab.sweep.plan import make_plan
     from gsstream_lab.sweep.tune import METHODS, give_first_frame, pilot
 
@@ -62,7 +63,10 @@ def tune(
     limits = _limits(resolve_recipe(None, catalog.recipe_path, (), budget_overrides(budget)).recipe, recording.source)
     known = catalog.names("method")
     tried = methods or [name for name in METHODS if name in known]
+    for name in tried:
+        catalog.entry("method", name)
     plan = make_plan(pilot(recording.scene(FRAMES), tried, limits, seed), Path(), catalog.recipe_path)
+    check_parts(plan, catalog)
     if first_frame is not None:
         give_first_frame(plan, out, stream_file(first_frame))
     trials = _run(plan, limits, out, workers=workers, quiet=quiet)

@@ -28,6 +28,7 @@ from gsstream.metrics import (
     slope_per_100,
     ssim,
 )
+from gsstream.packet import PacketKind
 from gsstream.player.playback import Playback
 from gsstream.player.render import PlayerRenderer, find_renderer, render
 
@@ -85,6 +86,8 @@ class Evaluation:
     views: tuple[ViewQuality, ...]  # in the order of frames, then cameras
     sigmas: Mapping[str, float]  # camera -> noise of one image, [0, 1] units
     renderer: str  # name of the player's renderer
+    #: Frames, but the first, whose scene was begun anew by a key packet: across one of them there is no drift.
+    later_keys: tuple[int, ...] = ()
     lpips_variant: str | None = None  # which LPIPS was measured; None: none, and neither table nor JSON speak of it
 
     def series(self, name: str) -> dict[int, float]:
@@ -120,6 +123,8 @@ class Evaluation:
             (first, psnr_first), later = next(iter(whole.items())), dict(list(whole.items())[1:])
             known = {t: v for t, v in later.items() if math.isfinite(v)}
             slope = slope_per_100(list(known), list(known.values()))
+            if prefix == "" and any(first < key <= max(whole) for key in self.later_keys):
+                slope = math.nan
             rest = [mean(v for t, v in self.series(prefix + n).items() if t != first) for n in quality]
             numbers = [psnr_first, mean(known.values()), slope, *rest]
             cells = zip(numbers, forms, strict=True)
@@ -200,7 +205,11 @@ def evaluate(
     renderer = find_renderer() if renderer is None else renderer
     with Playback(stream) as playback:
         shown = StreamFrames(playback, playback.cameras(split), renderer)
-        return evaluate_frames(shown, source, frames=frames, split=split, lpips=lpips, extras=extras, progress=progress)
+        keys = [frame for frame in playback.frames if playback.entry(frame).kind == PacketKind.KEY]
+        found = evaluate_frames(
+            shown, source, frames=frames, split=split, lpips=lpips, extras=extras, progress=progress
+        )
+    return replace(found, later_keys=tuple(keys[1:]))
 
 
 def evaluate_frames(
@@ -243,7 +252,7 @@ def evaluate_frames(
         if progress is not None:
             progress(done, len(chosen))
     variant = None if lpips is None else lpips.variant
-    return Evaluation(tuple(views), dict(zip(rig.ids, sigmas, strict=True)), shown.renderer, variant)
+    return Evaluation(tuple(views), dict(zip(rig.ids, sigmas, strict=True)), shown.renderer, lpips_variant=variant)
 
 
 def _compare(

@@ -12,7 +12,7 @@ import numpy as np
 from gsstream.engine.budget.report import budget_lines
 from gsstream.engine.run.live import latency_lines
 from gsstream.evaluation.records import FrameRecord, read_lines, read_records
-from gsstream.evaluation.summary import summarise, summary_table
+from gsstream.evaluation.summary import later_keys_line, summarise, summary_table
 from gsstream.input.recordings.base import Source
 from gsstream.packet import StreamMeta
 from gsstream.player.playback import Playback
@@ -53,6 +53,7 @@ def _still_pictures(out: Path, source: Source, meta: StreamMeta, records: Sequen
 
 def _write_summary(out: Path, meta: StreamMeta, records: Sequence[FrameRecord]) -> Path:
     text = [summary_table({meta.title: summarise(records)}), "", held_out_line(meta)]
+    text += ["", later] if (later := later_keys_line(records)) else []
     lines = read_lines(out / METRICS)
     if lines[0].get("blank_views") == len(meta.train):
         text += [

@@ -18,7 +18,7 @@ class Summary:
     #: psnr_first, psnr: dB, frame 0 and the mean of later frames.
     psnr_first: float
     psnr: float
-    psnr_slope: float  # dB per 100 frames
+    psnr_slope: float  # dB per 100 frames; nan where a later key packet began the scene anew: that is no drift
     ssim: float  # mean of later frames
     psnr_moving: float  # dB on moving pixels, mean of later frames where something moves
     kb_per_frame: float  # bytes of delta and empty packets over their number, 1 KB = 1,000 bytes
@@ -45,7 +45,9 @@ def summarise(records: Sequence[FrameRecord]) -> Summary:
         frames=len(records),
         psnr_first=mean(first.psnr.values()),
         psnr=mean(value for _, value in quality),
-        psnr_slope=slope_per_100([frame for frame, _ in finite], [value for _, value in finite]),
+        psnr_slope=math.nan
+        if any(r.is_key for r in later)
+        else slope_per_100([frame for frame, _ in finite], [value for _, value in finite]),
         ssim=mean(mean(r.ssim.values()) for r in later),
         psnr_moving=mean(mean(r.psnr_moving.values()) for r in later),
         kb_per_frame=mean(deltas),
@@ -59,6 +61,17 @@ def summarise(records: Sequence[FrameRecord]) -> Summary:
         peak_memory_mb=max((r.peak_memory_mb for r in records if math.isfinite(r.peak_memory_mb)), default=math.nan),
         psnr_changed=mean(mean(r.psnr_changed.values()) for r in later),
     )
+
+
+#: Later key packets that are listed one by one.
+_LISTED = 6
+
+
+def later_keys_line(records: Sequence[FrameRecord]) -> str:
+    """Return which later frames were sent as key packets, and their sizes; empty where none was."""
+    keys = [f"frame {r.frame} ({r.total_bytes / 1000:.1f} KB)" for r in records[1:] if r.is_key]
+    more = f" and {len(keys) - _LISTED} more" if len(keys) > _LISTED else ""
+    return f"later key packets: {', '.join(keys[:_LISTED])}{more}" if keys else ""
 
 
 #: Frames of the shortest run whose slope is shown: over fewer, dB per 100 frames is noise times a large number.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,10 +21,10 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.engine.run.metrics_log import last_written, trim_metrics
 from gsstream.engine.run.progress import frame_line
 from gsstream.evaluation.contact_sheet import Column, contact_sheet, most_changed_window, sheet_of_stream
-from gsstream.evaluation.evaluate import evaluate
+from gsstream.evaluation.evaluate import Evaluation, ViewQuality, evaluate
 from gsstream.evaluation.plots import plot_runs
 from gsstream.evaluation.records import FrameRecord, read_lines, read_records
-from gsstream.evaluation.summary import Summary, fitted, format_table, summarise, summary_table
+from gsstream.evaluation.summary import Summary, fitted, format_table, later_keys_line, summarise, summary_table
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.packet import KeyState, StreamMeta, StreamWriter, encode_delta, encode_empty, encode_key
 from gsstream.player.playback import Playback
@@ -183,6 +184,23 @@ def test_later_key_packets_are_not_delta_packets():
     run.append(FrameRecord(4, bytes={"layout": 1, "means": 50_000}))
     assert summarise(run).kb_per_frame == summarise(run[:-1]).kb_per_frame
     assert summarise(run).kb_amortised > summarise(run[:-1]).kb_amortised * 0.9
+
+
+def test_there_is_no_drift_across_a_later_key_packet_which_is_listed():
+    run = records()
+    assert later_keys_line(run) == ""
+    assert math.isfinite(summarise(run).psnr_slope)
+    run[2] = replace(run[2], bytes={"layout": 1, "means": 124_999})
+    assert math.isnan(summarise(run).psnr_slope)
+    assert later_keys_line(run) == "later key packets: frame 2 (125.0 KB)"
+    many = [run[0], *(replace(run[2], frame=frame) for frame in range(1, 10))]
+    assert later_keys_line(many).endswith("frame 6 (125.0 KB) and 3 more")
+    whole = Evaluation(tuple(ViewQuality(t, "a", 30.0 + t, 0.9, 30.0, 1.0, 20.0, 0.5, 20.0) for t in range(4)), {}, "r")
+    drift = [line.split("|")[4].strip() for line in whole.table().splitlines()[2:4]]
+    assert drift[0] == "+100.00"
+    for key, shown in ((0, "+100.00"), (1, "-"), (3, "-"), (4, "+100.00")):
+        rows = replace(whole, later_keys=(key,)).table().splitlines()
+        assert [line.split("|")[4].strip() for line in rows[2:4]] == [shown, drift[1]]
 
 
 def test_what_was_not_measured_is_a_dash():

@@ -14,7 +14,8 @@ function reasonOf(opened, { code, reason }, host) {
  * Keeps a WebSocket open from `start` to `stop`.
  *
  * `handlers`: `address()` gives the URL for the next connection; `opened()`; `message(data)` gets an ArrayBuffer or an
- * object; `trouble(sentence)` says why there is no connection.
+ * object; `trouble(sentence)` says why there is no connection; `over()` whether the stream has ended, so that a
+ * connection that breaks is not missed.
  */
 export class LiveSocket {
   constructor(handlers) {
@@ -44,6 +45,12 @@ export class LiveSocket {
   again(sentence) {
     this.stop();
     this._wait(sentence);
+  }
+
+  /** The connection broke. */
+  _lost(sentence) {
+    if (this.handlers.over()) this.stop();
+    else this.again(sentence);
   }
 
   /** Something useful came: the next failure is the first one again. */
@@ -77,7 +84,7 @@ export class LiveSocket {
       if (this.socket === socket) this._received(data);
     };
     socket.onclose = (event) => {
-      if (this.socket === socket) this.again(reasonOf(opened, event, new URL(address).host));
+      if (this.socket === socket) this._lost(reasonOf(opened, event, new URL(address).host));
     };
     this.clock = setInterval(() => this._watch(), settings.ask);
   }
@@ -113,7 +120,7 @@ export class LiveSocket {
 
   /** A server that does not even answer is gone, whatever the system believes of the connection. */
   _watch() {
-    if (performance.now() - this.heard > settings.patience) this.again("The server does not answer");
+    if (performance.now() - this.heard > settings.patience) this._lost("The server does not answer");
     else this._ask(this.socket);
   }
 

@@ -39,6 +39,7 @@ export class LiveBuffer {
         this.trouble = sentence;
         this._tell();
       },
+      over: () => this.state.name === "ended" && !this.broken,
     });
     this.clock = setInterval(() => this._tell(), 500);
     this.socket.start();

@@ -185,6 +185,11 @@ def test_the_end_and_silence_are_told(page, by_itself, packets, tmp_path):
         page.go(server.url)
         shows(page, 2)
         says(page, "The stream has ended.")
+    # The server goes, too, as that of a run does: nothing is missed, and nothing is tried again.
+    page.until(f"{BUFFER}.socket.socket === null")
+    time.sleep(1.2)
+    assert page.evaluate(MESSAGE) == "The stream has ended."
+    assert page.evaluate(f"[{BUFFER}.socket.socket, {BUFFER}.socket.timer]") == [None, None]
 
 
 @pytest.mark.parametrize("case", ["no stream", "newer", "token", "wrong token", "viewers", "nobody", "a recording"])

@@ -79,7 +79,7 @@ def prepare(
         made = make(raw, out, options, say=lambda line: None if quiet else typer.echo(line), tell=display.tell)
         display.tell("checking the scene")
         # The features have just been matched; how well they fit is in the report.
-        found = find(lambda scale: open_source(str(out), scale), features=False)
+        found = find(lambda scale: open_source(str(out), scale), features=False, say=display.tell)
         written = write_report(out, made, found, time.perf_counter() - began)
     _tell(made, found)
     if not quiet:
@@ -120,9 +120,12 @@ def validate(
     if frames < 1:
         raise InputError(f"--frames: expected at least 1, got {frames}")
     catalog = load_catalog()
-    with working("checking the scene"):
+    with working("checking the scene") as display:
         found = find(
-            lambda scale: open_recording(scene, Recipe(scale=scale), catalog), frames=frames, features=not no_features
+            lambda scale: open_recording(scene, Recipe(scale=scale), catalog),
+            frames=frames,
+            features=not no_features,
+            say=display.tell,
         )
     for finding in found:
         typer.echo(f"{finding.severity}: [{finding.code}] {finding.message}")

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
 #: Name of the work, number of its steps that are done, and of all its steps; 0 where the number is unknown.
 Tell = Callable[[str, int, int], None]
-#: Seconds after which a line is printed though nothing has changed. With the time that it takes to wake up, no more
-#: than five seconds lie between two lines.
+#: Seconds after which a line is printed though nothing has changed; the next ones take twice as long each. With the
+#: time that it takes to wake up, no more than five seconds lie between two lines about work that goes on.
 EVERY = 4.0
 #: Seconds of work after which its pace counts as known.
 PACE = 2.0
@@ -132,8 +132,9 @@ class ProgressDisplay:
                 console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def due(self) -> bool:
-        """Whether it is time for another plain line."""
-        return not self._quiet and self._bar is None and self._clock() - self._printed >= EVERY
+        """Whether it is time for another plain line: of work in which nothing changes, after twice the time each."""
+        pause = max(EVERY, self._printed - self._changed)
+        return not self._quiet and self._bar is None and self._clock() - self._printed >= pause
 
     def _watch(self) -> None:
         while not self._over.wait(0.25):

@@ -93,6 +93,27 @@ def test_work_that_says_nothing_is_shown_every_few_seconds(capsys: pytest.Captur
     assert capsys.readouterr().err == ""
 
 
+def test_work_in_which_nothing_changes_is_shown_ever_less_often(capsys: pytest.CaptureFixture[str]) -> None:
+    """An hour of one step, looked at four times a second: a dozen lines, not nine hundred."""
+    now = [0.0]
+    with ProgressDisplay(False, lambda: now[0]) as display:
+        display._over.set()  # the thread that looks at the clock has nothing to do here
+        display.tell("checking the scene")
+        printed = []
+        for tick in range(4 * 3600):
+            now[0] = tick / 4
+            if display.due():
+                display.say(display.line())
+                printed.append(now[0])
+        assert printed == [4.0 * 2**n for n in range(10)]
+        display.tell("checking the scene: do the clocks agree?")
+        assert display.due(), "something new is said at once, and then after four seconds again"
+        display.say(display.line())
+        now[0] += 4
+        assert display.due()
+    assert capsys.readouterr().err.count("\n") == 11
+
+
 def line(cameras: Cameras, **settings: Any) -> str:
     given = {f"first_frame.{key}": value for key, value in settings.items()}
     parts = assemble(recipe_for("dense", given), load_catalog())

@@ -31,7 +31,13 @@ FRAMES = 60
 Open = Callable[[float], Source]
 
 
-def validate(open_scene: Open, *, frames: int = FRAMES, features: bool = True) -> list[Finding]:
+#: Called with what is being looked at, before a check that takes time.
+Say = Callable[[str], None]
+
+
+def validate(
+    open_scene: Open, *, frames: int = FRAMES, features: bool = True, say: Say = lambda _: None
+) -> list[Finding]:
     """Return findings about a recording, errors first; none when it is fine."""
     try:
         source = open_scene(1.0)
@@ -39,7 +45,7 @@ def validate(open_scene: Open, *, frames: int = FRAMES, features: bool = True) -
         return [error("files" if isinstance(fault, FilesMissing) else "calibration", str(fault))]
     try:
         found: list[Finding] = []
-        for stage in _stages(source, open_scene, frames, features):
+        for stage in _stages(source, open_scene, frames, features=features, say=say):
             found += _merged(stage)
             if any(finding.severity == "error" for finding in stage):
                 break
@@ -61,7 +67,7 @@ def rig_of(source: Source) -> Cameras:
     return train.joined(test)
 
 
-def _stages(source: Source, open_scene: Open, frames: int, features: bool) -> Iterator[list[Finding]]:
+def _stages(source: Source, open_scene: Open, frames: int, *, features: bool, say: Say) -> Iterator[list[Finding]]:
     source = to_file_coordinates(source)
     rig, train = rig_of(source), source.info.train
     yield check_intrinsics(rig)
@@ -73,6 +79,7 @@ def _stages(source: Source, open_scene: Open, frames: int, features: bool) -> It
     yield check_placement(rig, len(train), points)
     yield check_axes(rig)
     yield check_overlap(train, train.ids)
+    say("checking the scene: reading its pictures")
     try:
         thumbs = _thumbnails(source, open_scene, rig, frames)
         train_frame = source.frame(0, "train")
@@ -84,14 +91,18 @@ def _stages(source: Source, open_scene: Open, frames: int, features: bool) -> It
     yield check_same(thumbs)
     yield check_change(thumbs)
     # Before clocks: where poses do not fit, what moves seems to be at different places although clocks may be right.
+    say("checking the scene: do the poses fit the pictures?")
     yield check_poses(train_frame)
+    say("checking the scene: do the clocks agree?")
     clocks = check_sync(thumbs)
     if clocks and features:
         # The same for poses that are wrong in a way that no convention explains.
         yield [finding for finding in _matched(first, rig_only=True) if finding.severity == "error"]
     yield clocks
+    say("checking the scene: are cameras exchanged?")
     yield check_swapped(first)
     if features:
+        say("checking the scene: matching features between cameras")
         yield _matched(first)
 
 

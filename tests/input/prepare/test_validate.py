@@ -66,6 +66,13 @@ def test_the_good_scene_and_the_demo_are_fine(good: Path, capsys: pytest.Capture
     )
 
 
+def test_what_is_looked_at_is_said_before_it_takes_time(good: Path) -> None:
+    said: list[str] = []
+    assert validate(lambda scale: open_source(str(good), scale), frames=4, features=False, say=said.append) == []
+    assert all(line.startswith("checking the scene: ") for line in said)
+    assert len(set(said)) == len(said) > 3
+
+
 def test_the_command_fails_on_a_bad_scene(good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bad = next(bad for bad in BAD if bad.name == "black")
     folder = spoiled(good, tmp_path / "scene", bad)

@@ -53,8 +53,6 @@ def build(out: Path, chosen: Sequence[Path], *, isolated: bool = True, aarch64: 
     out.mkdir(parents=True, exist_ok=True)
     if any(out.iterdir()):
         raise FileExistsError(f"{out} is not empty: expected a new folder, so that no archive of before stays in it")
-    if ROOT in chosen:  # the archives of gsstream hold the pages that are made from its code
-        subprocess.run([sys.executable, "-m", "tools.reference"], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
     environment = {**os.environ, "SOURCE_DATE_EPOCH": source_date(), "PIP_CONSTRAINT": str(PINS)}
     jobs: list[tuple[Path, dict[str, str], list[str]]] = [(project, {}, []) for project in chosen]
     jobs += [(RENDERER, for_aarch64(), ["--wheel"])] if aarch64 else []

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
+
 from tools.reference.pages import FOLDER, write
 
 
 def main() -> None:
-    """Write every page into docs/reference."""
+    """Write every page into docs/reference; ``--help`` writes none."""
+    argparse.ArgumentParser(prog="python -m tools.reference", description=__doc__).parse_args()
     for path in write(FOLDER):
         print(path)
 

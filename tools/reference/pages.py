@@ -1,7 +1,7 @@
 """Every page of docs/reference that is made from the code, by its file name.
 
-``BUILT`` pages are not in the repository (``docs/reference/.gitignore``): ``make docs`` and ``make dist`` write them.
-``TRACKED`` pages are, because messages of the program name them; a test compares them with what is made.
+They are in the repository, so that links lead somewhere in a fresh clone and messages of the program can name them; a
+test compares them with what is made.
 """
 
 from __future__ import annotations
@@ -16,9 +16,15 @@ from tools.reference.text import ROOT
 
 FOLDER = ROOT / "docs" / "reference"
 
-BUILT = {"api.md": api, "checks.md": checks, "cli.md": cli, "recipe.md": recipe, "hooks.md": hooks, "parts.md": parts}
-TRACKED = {"scene-checks.md": scene_checks}
-PAGES = BUILT | TRACKED
+PAGES = {
+    "api.md": api,
+    "checks.md": checks,
+    "cli.md": cli,
+    "hooks.md": hooks,
+    "parts.md": parts,
+    "recipe.md": recipe,
+    "scene-checks.md": scene_checks,
+}
 
 
 def write(folder: Path) -> list[Path]:

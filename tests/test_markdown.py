@@ -44,7 +44,7 @@ PLACES = "gsstream|plugins|tests|tools|docs|configs"
 #: Options of other programs that pages name: pip, pytest, make and the like.
 FOREIGN = {
     "--find-links", "--index-url", "--extra-index-url", "--no-build-isolation", "--no-deps", "--directory", "--bind",
-    "--no-binary",
+    "--no-binary", "--orphan", "--output-dir",
 }  # fmt: skip
 #: Files in which a comment or a message may name a page.
 SOURCES = {"", ".py", ".toml", ".yaml", ".js", ".mjs", ".cpp", ".hpp"}

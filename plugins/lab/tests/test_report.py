@@ -322,6 +322,67 @@ def test_a_folder_without_results_says_so(tmp_path):
         read_sweep_data(folder)
 
 
+def evaluated(path: Path, quality: float, cameras: str = "xy", frames: int = 3) -> Path:
+    """What ``evaluate --json`` writes: frame 0 is 3 dB better, nothing moves there, SSIM is of one camera."""
+    views = [
+        {
+            "frame": t,
+            "camera": camera,
+            "psnr": quality + 2 * (camera == "y") + 3 * (t == 0),
+            "psnr_moving": quality - 4 if t else None,
+            "ssim": 0.8 if camera == "x" else None,
+        }
+        for t in range(frames)
+        for camera in cameras
+    ]
+    path.write_text(json.dumps({"renderer": "pictures", "views": views}))
+    return path
+
+
+def test_rows_of_other_programs_stand_beside_ours(tmp_path, capsys):
+    folder = make_table(tmp_path / "s", [("a", "edge", BASE, 0, 30.0, 5, 1)])
+    mine = evaluated(tmp_path / "mine.json", 28.0)
+    assert run_command(["report", str(folder), "--add", str(mine), "--add", f"theirs={mine}"]) == 0
+    page = (folder / "report" / "report.md").read_text()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in page.splitlines() if "|" in line]
+    (head,) = [row for row in rows if row[-1] == "drawn by"]
+    for name in ("mine (added)", "theirs (added)"):
+        (row,) = [row for row in rows if row[0] == name]
+        found = dict(zip(head, row, strict=True))
+        assert found["PSNR 0, dB"] == "32.00"
+        assert found["PSNR, dB"] == "29.00"
+        assert found["moving, dB"] == "24.00"
+        assert found["SSIM"] == "0.8000"
+        assert "LPIPS" not in found
+        assert found["drawn by"] == "pictures"
+    (ours,) = [row for row in rows if row[0] == "edge" and row[-1] == "the player"]
+    assert dict(zip(head, ours, strict=True))["PSNR, dB"] == "31.00"
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        ({"cameras": "xz"}, "it has the test cameras x, z and 3 frames from 0"),
+        ({"frames": 2}, "it has the test cameras x, y and 2 frames from 0"),
+    ],
+)
+def test_rows_that_show_something_else_are_refused(tmp_path, capsys, other, said):
+    folder = make_table(tmp_path / "s", [("a", "edge", BASE, 0, 30.0, 5, 1)])
+    path = evaluated(tmp_path / "mine.json", 28.0, **other)
+    assert run_command(["report", str(folder), "--add", str(path)]) == 2
+    assert f"--add mine: {said}; expected those of a scene of this sweep (a)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"views": []}', '{"views": [{"frame": 0}], "renderer": "r"}'])
+def test_a_file_that_is_no_evaluation_is_refused(tmp_path, capsys, text):
+    folder = make_table(tmp_path / "s", [("a", "edge", BASE, 0, 30.0, 5, 1)])
+    (tmp_path / "x.json").write_text(text)
+    assert run_command(["report", str(folder), "--add", f"n={tmp_path / 'x.json'}"]) == 2
+    assert "expected what 'gsstream evaluate --json'" in capsys.readouterr().err
+    assert run_command(["report", str(folder), "--add", str(tmp_path / "absent.json")]) == 2
+    assert "No such file" in capsys.readouterr().err
+
+
 def test_a_line_of_progress():
     frame = {"psnr": {"a": 30.0, "b": None}, "psnr_moving": {"a": None}, "bytes": {"x": 500}, "seconds": {"y": 0.25}}
     assert summary_line([{}, frame, frame]) == "30.00 dB (moving nan), 0.5 KB, 0.25 s/frame"

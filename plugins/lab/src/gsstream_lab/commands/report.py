@@ -27,6 +27,14 @@ def report(
             help="Scenes to show pictures of, comma-separated. They hold images of the recording: mind its licence.",
         ),
     ] = "none",
+    add: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--add",
+            metavar="[NAME=]FILE",
+            help="What 'evaluate --json' or 'evaluate-files --json' wrote, to stand beside the runs; repeatable.",
+        ),
+    ] = None,
 ) -> None:
     """Write report.html (one file, no network), report.md and its figures.
 
@@ -34,10 +42,12 @@ def report(
     numbers beside ours where the sweep names a table of it. Everything is computed from the table.
     """
     from gsstream.core.install_hints import require_encoder
+    from gsstream_lab.report.added import beside, read_added
     from gsstream_lab.report.groups import read_sweep_data
 
     require_encoder()
     swept = read_sweep_data(folder)
+    others = beside(swept, [read_added(text) for text in add or ()])
     wanted = [] if sheets == "none" else [name.strip() for name in sheets.split(",") if name.strip()]
     for name in wanted:
         if name not in swept.scenes:
@@ -52,7 +62,7 @@ def report(
         with recording_of(swept, name, data) as source:
             shown[name] = contact_sheet(folder, swept, name, source)
     title = f"Sweep {swept.config['name']}"
-    written = write_report(title, build_report(swept, shown), out or folder / "report")
+    written = write_report(title, [*build_report(swept, shown), *others], out or folder / "report")
     typer.echo("\n".join(f"wrote {path}" for path in written[:2]))
     if swept.missing or swept.failed:
         typer.echo(f"{plural(len(swept.missing), 'cell')} not run yet, {len(swept.failed)} failed", err=True)

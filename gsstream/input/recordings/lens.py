@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -15,7 +16,7 @@ from gsstream.input.recordings.images import shrink
 
 _COLMAP = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_FISHEYE", "FISHEYE",
-    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE",
+    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "FOV",
 )  # fmt: skip
 _SIDES, _RINGS = 64, 24
 #: Bounds of the new focal length, as a factor: pictures are not stretched or cut more than this.
@@ -26,30 +27,38 @@ _WIDEST, _NARROWEST = 0.25, 2.0
 class Lens:
     """How a camera bends rays, on coordinates x / z, y / z."""
 
-    #: "radial": Brown-Conrady, as OpenCV's pinhole model; "fisheye": equidistant, as OpenCV's fisheye model.
-    kind: Literal["radial", "fisheye"]
-    k: tuple[float, ...]  # radial coefficients k1, k2, ...; of "radial", k4 to k6 divide (OpenCV's rational model)
-    p: tuple[float, float] = (0.0, 0.0)  # tangential coefficients p1, p2 ("radial" only)
+    #: "radial": Brown-Conrady, as OpenCV's pinhole model; "fisheye": equidistant, as OpenCV's fisheye model; "fov":
+    #: COLMAP's FOV, of Devernay and Faugeras.
+    kind: Literal["radial", "fisheye", "fov"]
+    #: Radial coefficients k1, k2, ...; of "radial", k4 to k6 divide (OpenCV's rational model); of "fov" its angle.
+    k: tuple[float, ...]
+    p: tuple[float, float] = (0.0, 0.0)  # tangential coefficients p1, p2
+    s: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # those of a thin prism, s1 to s4 as OpenCV's
 
     @property
     def is_identity(self) -> bool:
         """A fisheye never is: even with coefficients of zero it maps angles, not tangents."""
-        return self.kind == "radial" and not any((*self.k, *self.p))
+        return self.kind != "fisheye" and not any((*self.k, *self.p, *self.s))
 
     def distort(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return where this lens puts ideal pinhole coordinates."""
-        square = x * x + y * y
-        if self.kind == "fisheye":
-            radius = np.sqrt(square)
-            theta = np.arctan(radius)
-            bent = theta * (1 + _series(theta * theta, self.k))
-            factor = np.where(radius > 1e-12, bent / np.where(radius > 1e-12, radius, 1.0), 1.0)
+        radius = np.hypot(x, y)
+        away = np.where(radius > 1e-12, radius, 1.0)  # no division by zero in the middle
+        if self.kind == "fov":
+            (angle,) = self.k
+            slope = 2 * math.tan(angle / 2)
+            factor = np.where(radius > 1e-12, np.arctan(radius * slope) / away, slope) / angle
             return x * factor, y * factor
-        factor = (1 + _series(square, self.k[:3])) / (1 + _series(square, self.k[3:6]))
-        p1, p2 = self.p
+        top, bottom = self.k[:3], self.k[3:6]
+        if self.kind == "fisheye":
+            top, bottom, factor = self.k, (), np.where(radius > 1e-12, np.arctan(radius) / away, 1.0)
+            x, y = x * factor, y * factor
+        square = x * x + y * y
+        factor = (1 + _series(square, top)) / (1 + _series(square, bottom))
+        (p1, p2), (s1, s2, s3, s4) = self.p, self.s
         return (
-            x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x),
-            y * factor + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
+            x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x) + _series(square, (s1, s2)),
+            y * factor + p1 * (square + 2 * y * y) + 2 * p2 * x * y + _series(square, (s3, s4)),
         )
 
 
@@ -80,6 +89,12 @@ def from_colmap(model: str, params: Sequence[float], where: str) -> tuple[FloatA
             lens = Lens("radial", rest[:2], (rest[2], rest[3]))
         case "FULL_OPENCV":
             lens = Lens("radial", (*rest[:2], *rest[4:8]), (rest[2], rest[3]))
+        case "THIN_PRISM_FISHEYE":
+            lens = Lens("fisheye", (*rest[:2], *rest[4:6]), (rest[2], rest[3]), (rest[6], 0.0, rest[7], 0.0))
+        case "FOV":
+            if not abs(rest[0]) < math.pi:
+                raise SourceError(f"{where}: the angle of the model FOV must be below pi, got {rest[0]:g}")
+            lens = Lens("fov", rest) if rest[0] else Lens("radial", ())
         case _:
             lens = Lens("fisheye", rest)
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), lens
@@ -152,8 +167,8 @@ def _zoom(lens: Lens, K: FloatArray, size: tuple[int, int], first: FloatArray, l
     low, high = _WIDEST, _NARROWEST
     if not fits(high):
         raise SourceError(
-            f"{where}: the distortion {lens.kind} k = {list(lens.k)}, p = {list(lens.p)} leaves no usable picture; "
-            "check the coefficients and their order"
+            f"{where}: the distortion {lens.kind} k = {list(lens.k)}, p = {list(lens.p)}, s = {list(lens.s)} leaves no "
+            "usable picture; check the coefficients and their order"
         )
     while high - low > 1e-4:
         middle = (low + high) / 2

@@ -140,7 +140,7 @@ def test_coefficients_of_zero_are_no_lens_however_many(tmp_path: Path, world: Wo
     assert np.array_equal(open_source(str(folder)).info.train.Ks, plain.Ks)
 
 
-def test_eight_coefficients_bend_and_a_ninth_is_refused(tmp_path: Path, world: World) -> None:
+def test_eight_coefficients_bend_and_a_thirteenth_is_refused(tmp_path: Path, world: World) -> None:
     folder = write_enerf(tmp_path / "n", world)
     text = (folder / "intri.yml").read_text()
     (folder / "intri.yml").write_text(text.replace("[0.0, 0.0, 0.0, 0.0, 0.0]", "[0.1, 0, 0, 0, 0, 0.1, 0, 0]"))
@@ -150,9 +150,9 @@ def test_eight_coefficients_bend_and_a_ninth_is_refused(tmp_path: Path, world: W
     # (1 + 0.1 r^2) / (1 + 0.1 r^2) is no distortion: the fourth coefficient divides.
     assert np.allclose(plain.info.train.Ks, straight.info.train.Ks, rtol=1e-3)
     (folder / "intri.yml").write_text(
-        text.replace("[0.0, 0.0, 0.0, 0.0, 0.0]", "[0, 0, 0, 0, 0, 0, 0, 0, 0.1, 0, 0, 0]")
+        text.replace("[0.0, 0.0, 0.0, 0.0, 0.0]", "[0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0.1, 0]")
     )
-    with pytest.raises(SourceError, match="expected 0, 4, 5 or 8 coefficients"):
+    with pytest.raises(SourceError, match="expected 0, 4, 5, 8 or 12 coefficients"):
         open_source(str(folder))
 
 

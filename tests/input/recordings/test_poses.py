@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import SIZE, make_world, quaternion, write_colmap, write_enerf
 
-from gsstream.input.recordings.lens import Lens, undistortion
+from gsstream.core.errors import SourceError
+from gsstream.input.recordings.lens import Lens, from_colmap, undistortion
 from gsstream.input.recordings.open import open_source
 from gsstream.input.recordings.poses import (
     OPENGL_TO_OPENCV,
@@ -23,6 +27,7 @@ from gsstream.input.recordings.poses import (
     from_rotation_vector,
     invert,
 )
+from gsstream.input.recordings.rigs.camera import opencv_lens
 
 K = np.array([[40.0, 0, 24], [0, 42.0, 16], [0, 0, 1]])
 angles = st.floats(-3.1, 3.1)
@@ -89,6 +94,10 @@ lenses = st.one_of(
         lambda v: Lens("radial", v[:2], v[2:])
     ),
     st.tuples(st.floats(-0.05, 0.05), st.floats(-0.02, 0.02)).map(lambda v: Lens("fisheye", (*v, 0.0, 0.0))),
+    st.tuples(st.floats(-0.01, 0.01), st.floats(-0.01, 0.01)).map(
+        lambda v: Lens("fisheye", (0.02, -0.01), v, (v[1], 0.0, v[0], 0.0))
+    ),
+    st.floats(0.01, 1.2).map(lambda angle: Lens("fov", (angle,))),
 )
 
 
@@ -132,43 +141,77 @@ def test_a_smooth_picture_is_found_where_the_lens_put_it(lens: Lens) -> None:
     np.testing.assert_allclose(flat[1:-1, 1:-1, 1], ((fine_v - pinhole[1, 2]) / pinhole[1, 1])[1:-1, 1:-1], atol=2e-3)
 
 
+#: COLMAP's parameters, by its names of the models; the focal lengths differ where a model has two.
+MODELS: dict[str, tuple[float, ...]] = {
+    "SIMPLE_PINHOLE": (40, 24, 16),
+    "PINHOLE": (40, 42, 24, 16),
+    "SIMPLE_RADIAL": (40, 24, 16, -0.1),
+    "RADIAL": (40, 24, 16, -0.1, 0.02),
+    "OPENCV": (40, 42, 24, 16, -0.2, 0.05, 0.003, -0.002),
+    "FULL_OPENCV": (40, 42, 24, 16, -0.2, 0.05, 0.003, -0.002, 0.01, 0.02, -0.01, 0.003),
+    "SIMPLE_FISHEYE": (40, 24, 16),
+    "FISHEYE": (40, 42, 24, 16),
+    "SIMPLE_RADIAL_FISHEYE": (40, 24, 16, 0.02),
+    "RADIAL_FISHEYE": (40, 24, 16, 0.02, -0.01),
+    "OPENCV_FISHEYE": (40, 42, 24, 16, 0.02, -0.01, 0.004, -0.001),
+    "THIN_PRISM_FISHEYE": (40, 42, 24, 16, 0.02, -0.01, 0.003, -0.002, 0.004, -0.001, 0.005, -0.004),
+    "FOV": (40, 42, 24, 16, 0.9),
+}
+PROJECT = """
+import zlib, json, sys, numpy as np, pycolmap
+models, points = json.loads(sys.argv[1])
+rays = np.concatenate([np.array(points), np.ones((len(points), 1))], 1)
+seen = {
+    name: np.asarray(pycolmap.Camera(model=name, width=48, height=32, params=params).img_from_cam(rays)).tolist()
+    for name, params in models.items()
+}
+print(json.dumps([seen, list(pycolmap.CameraModelId.__members__)]))
+"""
+
+
 @pytest.mark.sfm
 @pytest.mark.skipif(importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed")
-@pytest.mark.parametrize(
-    ("model", "lens"),
-    [
-        ("OPENCV", Lens("radial", (-0.2, 0.05), (0.003, -0.002))),
-        ("FULL_OPENCV", Lens("radial", (-0.2, 0.05, 0.01, 0.02, -0.01, 0.003), (0.003, -0.002))),
-        ("OPENCV_FISHEYE", Lens("fisheye", (0.02, -0.01, 0.004, -0.001))),
-        ("RADIAL", Lens("radial", (-0.1, 0.02))),
-    ],
-)
-def test_lenses_bend_as_pycolmap_bends(model: str, lens: Lens) -> None:
-    """In a process of its own, as everything of pycolmap."""
-    import json
-    import subprocess
-    import sys
-
-    params = {
-        "OPENCV": [40, 42, 24, 16, *lens.k[:2], *lens.p],
-        "FULL_OPENCV": [40, 42, 24, 16, *lens.k[:2], *lens.p, *lens.k[2:]],
-        "OPENCV_FISHEYE": [40, 42, 24, 16, *lens.k],
-        "RADIAL": [40, 24, 16, *lens.k],
-    }[model]
-    points = np.random.default_rng(0).uniform(-0.5, 0.5, (30, 2))
-    code = (
-        "import zlib, json, sys, numpy as np, pycolmap\n"
-        "model, params, points = json.loads(sys.argv[1])\n"
-        "c = pycolmap.Camera(model=model, width=48, height=32, params=params)\n"
-        "rays = np.concatenate([np.array(points), np.ones((len(points), 1))], 1)\n"
-        "print(json.dumps(np.asarray(c.img_from_cam(rays)).tolist()))\n"
-    )
-    command = [sys.executable, "-c", code, json.dumps([model, params, points.tolist()])]
+def test_lenses_bend_as_pycolmap_bends_and_all_others_are_called_unsupported() -> None:
+    """In a process of its own, as everything of pycolmap; 1,000 rays up to 60 degrees from the axis, and the axis."""
+    points = np.random.default_rng(0).uniform(-1.2, 1.2, (1000, 2))
+    points[0] = 0
+    command = [sys.executable, "-c", PROJECT, json.dumps([MODELS, points.tolist()])]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stderr
-    x, y = lens.distort(points[:, 0], points[:, 1])
-    fy = 40 if model == "RADIAL" else 42
-    np.testing.assert_allclose(np.stack([40 * x + 24, fy * y + 16], 1), json.loads(done.stdout), atol=1e-9)
+    seen, every = json.loads(done.stdout)
+    for model, params in MODELS.items():
+        own, lens = from_colmap(model, params, "here")
+        x, y = lens.distort(points[:, 0], points[:, 1])
+        pixels = np.stack([own[0, 0] * x + own[0, 2], own[1, 1] * y + own[1, 2]], 1)
+        away = np.abs(pixels - seen[model]).max(1)
+        # Within 0.01 of the axis, COLMAP takes the first terms of a series for FOV.
+        assert (away < np.where((model == "FOV") & (np.hypot(*points.T) < 0.01), 1e-9, 1e-12)).all(), model
+    for model in set(every) - set(MODELS) - {"INVALID"}:
+        with pytest.raises(SourceError, match=f"the model {model} is not supported"):
+            from_colmap(model, (40.0,) * 20, "here")
+
+
+def test_an_angle_of_fov_that_is_none_is_refused_and_zero_is_a_pinhole() -> None:
+    assert from_colmap("FOV", (40, 42, 24, 16, 0), "here")[1].is_identity
+    with pytest.raises(SourceError, match=r"here: the angle of the model FOV must be below pi, got 3\.2"):
+        from_colmap("FOV", (40, 42, 24, 16, 3.2), "here")
+
+
+def test_the_prism_of_twelve_coefficients_bends_as_opencv_bends() -> None:
+    """Numbers of OpenCV 5.0's projectPoints; 14 coefficients with a tilt are refused."""
+    values = [-0.2, 0.05, 0.003, -0.002, 0.01, 0.02, -0.01, 0.003, 0.005, -0.004, 0.002, 0.001]
+    points = np.array([[0, 0], [0.5, -0.3], [-0.7, 0.6], [0.1, 0.8]])
+    expected = [
+        [0, 0],
+        [0.4650567690311692, -0.2768839014187015],
+        [-0.6083944245693684, 0.5261620067737445],
+        [0.08923726684273496, 0.7154906347418796],
+    ]
+    for more in ([], [0.0, 0.0]):
+        lens = opencv_lens([*values, *more], False, "here")
+        np.testing.assert_allclose(np.stack(lens.distort(*points.T), 1), expected, atol=1e-15)
+    with pytest.raises(SourceError, match="here: expected 0, 4, 5, 8 or 12 coefficients"):
+        opencv_lens([*values, 0.01, 0.0], False, "here")
 
 
 def test_readers_deliver_pinhole_cameras_for_distorted_ones(tmp_path: Path) -> None:

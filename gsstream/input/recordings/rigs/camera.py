@@ -91,16 +91,17 @@ def assembled_rig(
 def opencv_lens(values: Sequence[float], fisheye: bool, where: str) -> Lens:
     """Return the lens of OpenCV's coefficients: k1, k2, p1, p2, k3, k4, k5, k6, or k1 to k4 of a fisheye.
 
-    Of 12 or 14 coefficients, those behind the eighth must be zero; a lens of zeros alone is none, however many there
-    are.
+    With s1 to s4 of a thin prism there are 12; of 14, the tilt must be zero. Zeros alone are no lens, however many.
     """
     if fisheye and len(values) == 4:
         return Lens("fisheye", tuple(values))
-    if fisheye or (any(values) and (len(values) not in (4, 5, 8, 12, 14) or any(values[8:]))):
-        kind = "4 coefficients of a fisheye" if fisheye else "0, 4, 5 or 8 coefficients (k1, k2, p1, p2, k3 to k6)"
+    if fisheye or (any(values) and (len(values) not in (4, 5, 8, 12, 14) or any(values[12:]))):
+        told = "0, 4, 5, 8 or 12 coefficients (k1, k2, p1, p2, k3 to k6, s1 to s4)"
+        kind = "4 coefficients of a fisheye" if fisheye else told
         raise SourceError(f"{where}: expected {kind}, got {list(values)}")
     k1, k2, p1, p2, *more = (*values, 0.0, 0.0, 0.0, 0.0)[: max(4, len(values))]
-    return Lens("radial", (k1, k2, *more[:4]), (p1, p2))
+    s1, s2, s3, s4 = more[4:8] if len(values) >= 12 else (0.0,) * 4
+    return Lens("radial", (k1, k2, *more[:4]), (p1, p2), (s1, s2, s3, s4))
 
 
 def matched(calibrated: Sequence[str], pictures: Sequence[str]) -> dict[str, str]:

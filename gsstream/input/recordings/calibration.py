@@ -16,7 +16,7 @@ from gsstream.core.install_hints import page
 from gsstream.core.names import check_camera_ids
 from gsstream.input.recordings.base import Split
 from gsstream.input.recordings.clips import VIDEO_SUFFIXES, prepare_command
-from gsstream.input.recordings.foreign import MAX_NUMBER, MAX_SIDE, brief, matrix
+from gsstream.input.recordings.foreign import MAX_NUMBER, MAX_SIDE, Keys, brief, check_keys, matrix
 from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.rigs.camera import opencv_lens
 
@@ -25,6 +25,15 @@ SCHEMA = "opencv-multiview-1"
 #: checked before any memory is allocated and any file is opened.
 MAX_FRAMES, MAX_TEXT, MAX_PATTERN = 10_000_000, 1 << 20, 1000
 CALIBRATION_FILE = "cameras.json"
+_KEYS = Keys(
+    read=("schema", "name", "fps", "frames", "test_cameras", "licence", "cameras"),
+    idle=("convention", "source", "derived_from", "depth", "dynamic_mask", "bounds", "notes"),
+)
+_CAMERA_KEYS = Keys(
+    read=("id", "split", "width", "height", "K", "w2c", "frames", "distortion", "fisheye"),
+    idle=("colmap_name", "photometric", "notes"),
+    refused=("camera_model", "is_fisheye", "dist", "skew", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +70,8 @@ def read_calibration(folder: Path, *, growing: bool = False, any_sizes: bool = F
     cameras = data.get("cameras")
     if not isinstance(cameras, list) or not cameras or not all(isinstance(c, dict) for c in cameras):
         raise SourceError(f"{path}: 'cameras' must be a non-empty list of objects, got {brief(cameras)}")
+    check_keys(str(path), [data], _KEYS)
+    check_keys(f"{path}: cameras", cameras, _CAMERA_KEYS)
     ids = [_camera_id(path, camera, index) for index, camera in enumerate(cameras)]
     if len(set(ids)) != len(ids):
         twice = sorted({i for i in ids if ids.count(i) > 1})

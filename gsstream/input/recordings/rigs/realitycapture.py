@@ -16,6 +16,7 @@ import numpy as np
 
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
+from gsstream.input.recordings.foreign import Keys, check_keys, parsed
 from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.poses import from_opengl, from_rotation_vector
 from gsstream.input.recordings.rigs.camera import RigCamera
@@ -23,6 +24,21 @@ from gsstream.input.recordings.rigs.camera import RigCamera
 SUFFIXES = (".xmp", ".csv")
 FILM = 36.0
 _SPACE = "{http://www.capturingreality.com/ns/xcr/1.1#}"
+#: By RealityCapture's page on metadata; priors and groups steer an alignment.
+_METADATA = Keys(
+    read=(
+        "Rotation", "Position", "DistortionModel", "DistortionCoeficients", "FocalLength35mm", "PrincipalPointU",
+        "PrincipalPointV", "AspectRatio",
+    ),
+    idle=(
+        "Version", "PosePrior", "Coordinates", "CalibrationPrior", "CalibrationGroup", "DistortionGroup", "Rig",
+        "RigInstance", "RigPoseIndex", "InTexturing", "InMeshing", "InColoring", "ComponentId",
+    ),
+    refused=("Skew",),
+)  # fmt: skip
+_OPTICS, _LENS = ("f", "px", "py"), ("k1", "k2", "k3", "k4", "t1", "t2")
+_PLACE, _TURN = ("x", "y", "alt"), ("heading", "pitch", "roll")
+_COLUMNS = Keys(read=("#name", *_PLACE, *_TURN, *_OPTICS, *_LENS), refused=("skew", "aspect"))
 
 
 def read(path: Path, text: str) -> list[RigCamera]:
@@ -31,7 +47,9 @@ def read(path: Path, text: str) -> list[RigCamera]:
         if "capturingreality.com/ns/xcr" in text:
             return [_from_metadata(path, ElementTree.fromstring(text))]
         if text.startswith("#name,") and "heading" in text.split("\n", 1)[0]:
-            return [_from_row(path, row) for row in csv.DictReader(text.splitlines())]
+            return [
+                _from_row(path, row) for row in csv.DictReader(text.splitlines(), restkey="(columns without a name)")
+            ]
     except (ElementTree.ParseError, KeyError, ValueError, TypeError) as error:
         raise SourceError(f"{path}: not cameras of RealityCapture: {error!r}") from error
     return []
@@ -40,36 +58,47 @@ def read(path: Path, text: str) -> list[RigCamera]:
 def _from_metadata(path: Path, root: ElementTree.Element) -> RigCamera:
     found = {key: value for entry in root.iter() for key, value in entry.attrib.items()}
     found |= {entry.tag: entry.text or "" for entry in root.iter() if not len(entry)}
+    found = {key.removeprefix(_SPACE): value for key, value in found.items() if key.startswith(_SPACE)}
+    check_keys(str(path), [found], _METADATA)
 
-    def numbers(key: str) -> list[float]:
-        return [float(word) for word in found[_SPACE + key].split()]
+    def numbers(key: str, *counts: int) -> FloatArray:
+        return parsed(str(path), key, found[key].split(), *counts)
 
-    w2c = np.eye(4)
-    w2c[:3, :3] = np.array(numbers("Rotation")).reshape(3, 3)
-    w2c[:3, 3] = -w2c[:3, :3] @ numbers("Position")
-    model = found[_SPACE + "DistortionModel"]
-    coefficients = numbers("DistortionCoeficients")  # the format's own spelling
-    if not model.startswith("brown") and any(coefficients):
+    w2c = None
+    if "Rotation" in found and "Position" in found:
+        w2c = np.eye(4)
+        w2c[:3, :3] = numbers("Rotation", 9).reshape(3, 3)
+        w2c[:3, 3] = -w2c[:3, :3] @ numbers("Position", 3)
+    model, coefficients = found["DistortionModel"], numbers("DistortionCoeficients", 6)  # the format's own spelling
+    if not model.startswith("brown") and coefficients.any():
         raise SourceError(f"{path}: the lens model {model!r} is not supported; export with a model of Brown")
-    u, v = numbers("PrincipalPointU")[0], numbers("PrincipalPointV")[0]
-    return _made(path, path.stem, w2c, optics=(numbers("FocalLength35mm")[0] / FILM, u, v), coefficients=coefficients)
+    if "AspectRatio" in found and numbers("AspectRatio", 1)[0] != 1:
+        raise SourceError(f"{path}: expected AspectRatio 1, got {found['AspectRatio']}; align with square pixels")
+    u, v = numbers("PrincipalPointU", 1)[0], numbers("PrincipalPointV", 1)[0]
+    optics = (numbers("FocalLength35mm", 1)[0] / FILM, u, v)
+    return _made(path, path.stem, w2c, optics=optics, coefficients=coefficients)
 
 
 def _from_row(path: Path, row: dict[str, str]) -> RigCamera:
-    heading, pitch, roll = (np.radians(float(row[key])) for key in ("heading", "pitch", "roll"))
+    check_keys(str(path), [row], _COLUMNS)
+    name = Path(row["#name"]).stem
+
+    def numbers(keys: Sequence[str]) -> FloatArray:
+        return parsed(f"{path}: camera {name!r}", ", ".join(keys), [row[key] for key in keys])
+
+    heading, pitch, roll = np.radians(numbers(_TURN))
     turns = zip((2, 0, 1), (-heading, pitch, roll), strict=True)
     z, x, y = (from_rotation_vector(angle * np.eye(3)[axis]) for axis, angle in turns)
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = z @ x @ y, [float(row[key]) for key in ("x", "y", "alt")]
-    f, u, v = (float(row[key]) / FILM for key in ("f", "px", "py"))
-    coefficients = [float(row[key]) for key in ("k1", "k2", "k3", "k4", "t1", "t2")]
-    return _made(path, Path(row["#name"]).stem, from_opengl(pose), optics=(f, u, v), coefficients=coefficients)
+    pose[:3, :3], pose[:3, 3] = z @ x @ y, numbers(_PLACE)
+    f, u, v = numbers(_OPTICS) / FILM
+    return _made(path, name, from_opengl(pose), optics=(f, u, v), coefficients=numbers(_LENS))
 
 
 def _made(
-    path: Path, name: str, w2c: FloatArray, optics: tuple[float, float, float], coefficients: Sequence[float]
+    path: Path, name: str, w2c: FloatArray | None, optics: tuple[float, float, float], coefficients: FloatArray
 ) -> RigCamera:
-    k1, k2, k3, k4, t1, t2 = coefficients
+    k1, k2, k3, k4, t1, t2 = coefficients.tolist()
     if k4:
         raise SourceError(f"{path}: camera {name!r}: k4 is not supported: align with a model of Brown without it")
     f, u, v = optics

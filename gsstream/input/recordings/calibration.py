@@ -26,13 +26,13 @@ SCHEMA = "opencv-multiview-1"
 MAX_FRAMES, MAX_TEXT, MAX_PATTERN = 10_000_000, 1 << 20, 1000
 CALIBRATION_FILE = "cameras.json"
 _KEYS = Keys(
-    read=("schema", "name", "fps", "frames", "test_cameras", "licence", "cameras"),
-    idle=("convention", "source", "derived_from", "depth", "dynamic_mask", "bounds", "notes"),
+    read="schema name fps frames test_cameras licence cameras",
+    idle="convention source derived_from depth dynamic_mask bounds notes",
 )
 _CAMERA_KEYS = Keys(
-    read=("id", "split", "width", "height", "K", "w2c", "frames", "distortion", "fisheye"),
-    idle=("colmap_name", "photometric", "notes"),
-    refused=("camera_model", "is_fisheye", "dist", "skew", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"),
+    read="id split width height K w2c frames distortion fisheye",
+    idle="colmap_name photometric notes",
+    refused="camera_model is_fisheye dist skew k1 k2 k3 k4 k5 k6 p1 p2",
 )
 
 

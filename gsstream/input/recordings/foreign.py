@@ -27,13 +27,13 @@ MAX_NUMBER = 1e300
 
 @dataclass(frozen=True, slots=True)
 class Keys:
-    """What a format may hold. A trailing ``*`` stands for any ending, such as the name of a camera."""
+    """What a format may hold: names with blanks between them. ``*`` at the end stands for any ending."""
 
-    read: tuple[str, ...]
+    read: str
     #: Known, and without effect on poses, lenses, times and points.
-    idle: tuple[str, ...] = ()
+    idle: str = ""
     #: They say how to read numbers, and gsstream does not: refused unless they say nothing (zero, false, null, empty).
-    refused: tuple[str, ...] = ()
+    refused: str = ""
 
 
 def check_keys(where: str, found: Iterable[Mapping[str, Any]], known: Keys) -> None:
@@ -42,19 +42,20 @@ def check_keys(where: str, found: Iterable[Mapping[str, Any]], known: Keys) -> N
     Raises SourceError for a refused key that says something, and for another spelling of a key that is read.
     """
     unknown: dict[str, None] = {}
-    spelled = {_bare(key): key for key in known.read if not key.endswith("*")}
+    read, idle, refused = known.read.split(), known.idle.split(), known.refused.split()
+    spelled = {_bare(key): key for key in read if not key.endswith("*")}
     for entry in found:
         for key, value in entry.items():
-            if _fits(key, known.refused):
+            if _fits(key, refused):
                 if _says(value):
                     told = f"{where}: {key!r} is not supported, and says how to read the file, got {brief(value)}"
                     raise SourceError(f"{told}: export without this key, or undistort the pictures")
-            elif not _fits(key, known.read) and not _fits(key, known.idle):
+            elif not _fits(key, read) and not _fits(key, idle):
                 if near := spelled.get(_bare(key)):
                     raise SourceError(f"{where}: the key {key!r} is not known; did you mean {near!r}?")
                 unknown[key] = None
     if unknown:
-        names = [key.rstrip("*") for key in (*known.read, *known.idle)]
+        names = [key.rstrip("*") for key in (*read, *idle)]
         near = suggest(next(iter(unknown)), names) if len(unknown) == 1 else ""
         told = ", ".join(f"{key!r}" for key in list(unknown)[:8]) + (", ..." if len(unknown) > 8 else "")
         near = near if "did you mean" in near else ""

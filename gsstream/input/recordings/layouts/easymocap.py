@@ -24,8 +24,8 @@ from gsstream.input.recordings.rigs.opencv_yaml import load_storage
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
 #: Keys that EasyMocap and EasyVolcap write; near and far planes, bounds and colour matrices belong to rendering.
-_INTRI = Keys(read=("names", "K_*", "dist_*", "D_*", "W_*", "H_*"), idle=("ccm_*",), refused=("xi_*", "model_*"))
-_EXTRI = Keys(read=("names", "Rot_*", "R_*", "T_*"), idle=("t_*", "n_*", "f_*", "bounds_*"), refused=("RT_*",))
+_INTRI = Keys(read="names K_* dist_* D_* W_* H_*", idle="ccm_*", refused="xi_* model_*")
+_EXTRI = Keys(read="names Rot_* R_* T_*", idle="t_* n_* f_* bounds_*", refused="RT_*")
 
 
 def looks_like(folder: Path) -> bool:

@@ -37,69 +37,19 @@ _OPTIONAL = ("w", "h", "fps", "time", "camera_model", "is_fisheye", "transform_m
 #: Keys that nerfstudio, instant-ngp and exporters for Blender write; those without an effect belong to training or to
 #: masks.
 _KEYS = Keys(
-    read=(*INTRINSICS, "fps", "time", "frames", "file_path", "transform_matrix", "ply_file_path", *_SPLITS),
-    idle=(
-        "applied_transform",
-        "applied_scale",
-        "orientation_override",
-        "auto_scale_poses_override",
-        "aabb_scale",
-        "aabb",
-        "scale",
-        "offset",
-        "from_na",
-        "sharpness",
-        "up",
-        "n_images",
-        "enable_depth_loading",
-        "integer_depth_scale",
-        "enable_ray_loading",
-        "white_transparent",
-        "black_transparent",
-        "fix_premult",
-        "light_dir",
-        "render_aabb",
-        "colmap_im_id",
-        "colmap_image_id",
-        "depth_file_path",
-        "depth_unit_scale_factor",
-        "mask_path",
-        "normal_file_path",
-        "semantics_file_path",
-        "panoptic_classes",
-        "rotation",
-        "camera_id",
-        "cam_id",
-    ),
-    refused=(
-        "rolling_shutter",
-        "latlong",
-        "ftheta_*",
-        "k7",
-        "k8",
-        "p3",
-        "p4",
-        "b1",
-        "b2",
-        "s1",
-        "s2",
-        "s3",
-        "s4",
-        "sk_x",
-        "sx1",
-        "sx2",
-        "sy1",
-        "sy2",
-        "skew",
-        "is_equirectangular",
-        "distortion_params",
-        "camera_convention",
-        "coordinate_system",
-        "is_ortho",
-        "ortho_scale",
-        "shift_x",
-        "shift_y",
-    ),
+    read=" ".join((*INTRINSICS, *_SPLITS)) + " fps time frames file_path transform_matrix ply_file_path",
+    idle="""
+        applied_transform applied_scale orientation_override auto_scale_poses_override aabb_scale aabb scale
+        offset from_na sharpness up n_images enable_depth_loading integer_depth_scale enable_ray_loading
+        white_transparent black_transparent fix_premult light_dir render_aabb colmap_im_id colmap_image_id
+        depth_file_path depth_unit_scale_factor mask_path normal_file_path semantics_file_path panoptic_classes
+        rotation camera_id cam_id
+    """,
+    refused="""
+        rolling_shutter latlong ftheta_* k7 k8 p3 p4 b1 b2 s1 s2 s3 s4 sk_x sx1 sx2 sy1 sy2 skew
+        is_equirectangular distortion_params camera_convention coordinate_system is_ortho ortho_scale shift_x
+        shift_y
+    """,
 )
 
 

@@ -25,7 +25,7 @@ from gsstream.input.recordings.recorded import Recording, SeenPoints
 TRAIN, TEST, IMAGES, POINTS = "train_meta.json", "test_meta.json", "ims", "init_pt_cld.npz"
 
 #: Keys that Dynamic 3D Gaussians writes.
-_KEYS = Keys(read=("w", "h", "k", "w2c", "fn", "cam_id"), idle=("near", "far"), refused=("dist", "distCoef", "fisheye"))
+_KEYS = Keys(read="w h k w2c fn cam_id", idle="near far", refused="dist distCoef fisheye")
 
 
 def looks_like(folder: Path) -> bool:

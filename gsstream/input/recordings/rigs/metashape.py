@@ -23,9 +23,9 @@ SUFFIXES = (".xml",)
 Optics = tuple[FloatArray, Lens, tuple[int, int] | None]
 #: Elements of a calibration.
 _KEYS = Keys(
-    read=("resolution", "f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "b1", "b2"),
-    idle=("covariance", "date", "params", "meta"),
-    refused=("p3", "p4", "fx", "fy", "skew", "rolling_shutter"),
+    read="resolution f cx cy k1 k2 k3 k4 p1 p2 b1 b2",
+    idle="covariance date params meta",
+    refused="p3 p4 fx fy skew rolling_shutter",
 )
 
 

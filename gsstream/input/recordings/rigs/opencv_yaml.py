@@ -26,46 +26,16 @@ SUFFIXES = (".yml", ".yaml")
 
 #: Keys that OpenCV's samples, MC-Calib and the tools of ROS write.
 _KEYS = Keys(
-    read=(
-        "camera_matrix",
-        "K",
-        "R",
-        "rvec",
-        "Rot",
-        "T",
-        "tvec",
-        "distortion_coefficients",
-        "distortion",
-        "D",
-        "dist",
-        "image_width",
-        "image_height",
-        "model",
-        "distortion_model",
-    ),
-    idle=(
-        "calibration_time",
-        "nframes",
-        "nr_of_frames",
-        "board_width",
-        "board_height",
-        "square_size",
-        "flags",
-        "image_list",
-        "image_points",
-        "grid_points",
-        "extrinsic_parameters",
-        "avg_reprojection_error",
-        "per_view_*",
-        "camera_name",
-        "F",
-        "P",
-        "rectification_matrix",
-        "projection_matrix",
-        "aspectRatio",
-        "names",
-    ),
-    refused=("xi", "skew", "distortion_type", "camera_group", "lens_model"),
+    read="""
+        camera_matrix K R rvec Rot T tvec distortion_coefficients distortion D dist image_width image_height
+        model distortion_model
+    """,
+    idle="""
+        calibration_time nframes nr_of_frames board_width board_height square_size flags image_list image_points
+        grid_points extrinsic_parameters avg_reprojection_error per_view_* camera_name F P rectification_matrix
+        projection_matrix aspectRatio names
+    """,
+    refused="xi skew distortion_type camera_group lens_model",
 )
 _FISHEYE, _BROWN = (
     ("fisheye", "equidistant", "opencv_fisheye"),

@@ -22,19 +22,12 @@ SUFFIXES = (".txt", ".xml")
 UNIT = 1 / 64
 #: Attributes of ``intrinsic``; those of the sensor and the lens in millimetres say nothing of pixels.
 _KEYS = Keys(
-    read=(
-        "focalLengthU",
-        "focalLengthV",
-        "centerPointU",
-        "centerPointV",
-        "radialDistortion1",
-        "radialDistortion2",
-        "radialDistortion3",
-        "tangentalDistortion1",
-        "tangentalDistortion2",
-    ),
-    idle=("focallength", "sensorMinU", "sensorMaxU", "sensorMinV", "sensorMaxV"),
-    refused=("skew", "radialDistortion4", "radialDistortion5", "radialDistortion6"),
+    read="""
+        focalLengthU focalLengthV centerPointU centerPointV radialDistortion1 radialDistortion2 radialDistortion3
+        tangentalDistortion1 tangentalDistortion2
+    """,
+    idle="focallength sensorMinU sensorMaxU sensorMinV sensorMaxV",
+    refused="skew radialDistortion4 radialDistortion5 radialDistortion6",
 )
 
 

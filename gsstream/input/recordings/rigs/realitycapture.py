@@ -26,19 +26,19 @@ FILM = 36.0
 _SPACE = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 #: By RealityCapture's page on metadata; priors and groups steer an alignment.
 _METADATA = Keys(
-    read=(
-        "Rotation", "Position", "DistortionModel", "DistortionCoeficients", "FocalLength35mm", "PrincipalPointU",
-        "PrincipalPointV", "AspectRatio",
-    ),
-    idle=(
-        "Version", "PosePrior", "Coordinates", "CalibrationPrior", "CalibrationGroup", "DistortionGroup", "Rig",
-        "RigInstance", "RigPoseIndex", "InTexturing", "InMeshing", "InColoring", "ComponentId",
-    ),
-    refused=("Skew",),
-)  # fmt: skip
+    read="""
+        Rotation Position DistortionModel DistortionCoeficients FocalLength35mm PrincipalPointU PrincipalPointV
+        AspectRatio
+    """,
+    idle="""
+        Version PosePrior Coordinates CalibrationPrior CalibrationGroup DistortionGroup Rig RigInstance
+        RigPoseIndex InTexturing InMeshing InColoring ComponentId
+    """,
+    refused="Skew",
+)
 _OPTICS, _LENS = ("f", "px", "py"), ("k1", "k2", "k3", "k4", "t1", "t2")
 _PLACE, _TURN = ("x", "y", "alt"), ("heading", "pitch", "roll")
-_COLUMNS = Keys(read=("#name", *_PLACE, *_TURN, *_OPTICS, *_LENS), refused=("skew", "aspect"))
+_COLUMNS = Keys(read="#name x y alt heading pitch roll f px py k1 k2 k3 k4 t1 t2", refused="skew aspect")
 
 
 def read(path: Path, text: str) -> list[RigCamera]:

@@ -22,20 +22,9 @@ from gsstream.input.recordings.rigs.camera import RigCamera, opencv_lens
 SUFFIXES = (".toml",)
 #: Keys of a camera that Anipose, Pose2Sim and Caliscope write.
 _KEYS = Keys(
-    read=(
-        "name",
-        "cam_id",
-        "port",
-        "ignore",
-        "size",
-        "matrix",
-        "distortions",
-        "fisheye",
-        "rotation",
-        "translation",
-    ),
-    idle=("rotation_count", "exposure", "error", "grid_count", "verified_resolutions"),
-    refused=("extra_distortions", "skew", "distortion_model", "model", "convention"),
+    read="name cam_id port ignore size matrix distortions fisheye rotation translation",
+    idle="rotation_count exposure error grid_count verified_resolutions",
+    refused="extra_distortions skew distortion_model model convention",
 )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import warnings
 from pathlib import Path
 from typing import Any
@@ -165,3 +166,43 @@ def test_cameras_of_two_sizes_name_the_command_that_mends_it(tmp_path, world) ->
         pytest.warns(RecordingWarning, match="1 of 4 cameras are calibrated for another size"),
     ):
         open_source(str(folder))
+
+
+def split_files(folder: Path, timed: bool) -> tuple[str, str]:
+    """The same cameras as one transforms.json, and as Blender's files per split, each with its own shared keys."""
+    world = make_world(views=4, frames=3 if timed else 1)
+    write_nerfstudio(folder / "one", world, style="timed" if timed else "folders")
+    data = json.loads((folder / "one" / "transforms.json").read_text())
+    del data["ply_file_path"]
+    (folder / "one" / "transforms.json").write_text(json.dumps(data))
+    entries, tests = data.pop("frames"), data.pop("test_filenames")
+    (folder / "split").mkdir()
+    for number, entry in enumerate(entries):
+        held = entry["file_path"] in tests
+        picture = folder / "one" / entry["file_path"]
+        place = folder / "split" / ("test" if held else "train")
+        place.mkdir(exist_ok=True)
+        (place / f"r_{number}.png").write_bytes((picture if timed else picture / "0000.png").read_bytes())
+        entry["file_path"], entry["held"] = f"./{place.name}/r_{number}", held
+    for name, held in (("train", False), ("test", True)):
+        own = [
+            {k: v for k, v in entry.items() if k not in ("held", "fl_x")} for entry in entries if entry["held"] == held
+        ]
+        # One focal length for the file, as Blender's add-ons write it.
+        shared = {"camera_angle_x": 2 * math.atan(data["w"] / 2 / entries[0]["fl_x"])}
+        (folder / "split" / f"transforms_{name}.json").write_text(json.dumps({**data, **shared, "frames": own}))
+    return str(folder / "one"), str(folder / "split")
+
+
+@pytest.mark.parametrize("timed", [False, True])
+def test_a_file_per_split_is_read_as_one_file_with_lists(tmp_path: Path, timed: bool) -> None:
+    one, split = (open_source(name) for name in split_files(tmp_path, timed))
+    assert split.info.num_frames == one.info.num_frames == (3 if timed else 1)
+    assert split.info.fps == 25
+    for a, b in ((split.info.train, one.info.train), (split.info.test, one.info.test)):
+        assert np.allclose(a.viewmats, b.viewmats)
+        assert np.allclose(a.Ks, b.Ks)
+    for t in range(one.info.num_frames or 0):
+        for kind in ("train", "test"):
+            assert np.array_equal(split.frame(t, kind).images, one.frame(t, kind).images)  # type: ignore[arg-type]
+    assert timed or split.info.test.ids == ("test_r_0",)

@@ -10,6 +10,8 @@ Entries of one folder with equal poses are one camera's frames, in the order of 
 in one flat folder those of equal pose and intrinsics are. Entries without a picture or a pose are skipped, with a
 warning. ``test_filenames`` (and ``val_filenames``) are test cameras; without them there is none. Where there are
 ``train_filenames``, cameras of no list are left out. ``ply_file_path``: points, made from all images.
+
+Blender's scenes have transforms_train.json, and transforms_val.json and transforms_test.json with the test cameras.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ from gsstream.input.recordings.pointfiles import read_ply_points
 from gsstream.input.recordings.recorded import Recording, SeenPoints
 from gsstream.input.recordings.rigs.camera import assembled_rig
 
-FILE = "transforms.json"
+FILE, SPLIT_FILE = "transforms.json", "transforms_{}.json"
 Missing = Literal["skip", "refuse"]
 _SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 #: null counts as not given.
@@ -54,8 +56,8 @@ _KEYS = Keys(
 
 
 def looks_like(folder: Path) -> bool:
-    """Say whether there is a transforms.json."""
-    return (folder / FILE).is_file()
+    """Say whether there is a transforms.json, or one of Blender's per split."""
+    return (folder / FILE).is_file() or (folder / SPLIT_FILE.format("train")).is_file()
 
 
 def read(folder: Path, missing: Missing = "skip") -> Recording:
@@ -63,11 +65,11 @@ def read(folder: Path, missing: Missing = "skip") -> Recording:
 
     Raises SourceError for a camera that moves, and for what is not as expected.
     """
-    path = folder / FILE
-    data = _load(path)
+    path, data = _load(folder)
     files = _files(folder, data["frames"])
     there = _present(path, data["frames"], files, missing)
-    groups = group_entries(path, there, pose_of)
+    split = path.name != FILE and not any("time" in entry for entry in there)
+    groups = {_name(entry): [entry] for entry in there} if split else group_entries(path, there, pose_of)
     if len(there) < len(data["frames"]) and any(len(g) > 1 and "time" not in g[0] for g in groups.values()):
         raise SourceError(
             f"{path}: pictures of a recording are missing, and no 'time' says which instants are left: the cameras "
@@ -93,7 +95,25 @@ def read(folder: Path, missing: Missing = "skip") -> Recording:
     )
 
 
-def _load(path: Path) -> dict[str, Any]:
+def _load(folder: Path) -> tuple[Path, dict[str, Any]]:
+    """What transforms.json holds, else what the files of Blender's splits do: the test cameras are those of two."""
+    if (folder / FILE).is_file():
+        return folder / FILE, _load_one(folder / FILE)
+    whole: dict[str, Any] = {"frames": []}
+    for split, names in zip(("train", "val", "test"), _SPLITS, strict=True):
+        if (path := folder / SPLIT_FILE.format(split)).is_file():
+            part = _load_one(path)
+            shared = {key: part.pop(key) for key in INTRINSICS if key in part}
+            frames = [shared | entry for entry in part.pop("frames")]
+            whole = part | whole | {"frames": whole["frames"] + frames, names: [f["file_path"] for f in frames]}
+    return folder / SPLIT_FILE.format("train"), whole
+
+
+def _name(entry: dict[str, Any]) -> str:
+    return str(PurePosixPath(entry["file_path"]).with_suffix("")).replace("/", "_")
+
+
+def _load_one(path: Path) -> dict[str, Any]:
     known = read_json(path)
     frames = known.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):

@@ -106,6 +106,17 @@ def spoiled(text: str, value: Any, as_json: bool) -> Iterator[tuple[str, str]]:
         yield text[max(0, found.start() - 30) : found.end()], text[: found.start()] + word + text[found.end() :]
 
 
+def spoiled_rows(rows: np.ndarray, value: Any) -> Iterator[tuple[str, np.ndarray]]:
+    """What an array becomes, per number of its first row: as numpy keeps such a value, with a type of its own."""
+    for column in range(rows.shape[1]):
+        data: np.ndarray = rows.astype(object)
+        data[0, column] = value
+        try:
+            yield str(column), data.astype(type(value) if isinstance(value, str | bool) else float)
+        except (TypeError, ValueError, OverflowError):
+            yield str(column), data
+
+
 def known(folder: Path) -> SourceInfo | Exception:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -155,3 +166,22 @@ def test_what_is_no_number_is_refused_or_has_no_effect(tmp_path: Path, name: str
         path.write_text(text)
     assert tried > 5 * len(VALUES)
     shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in VALUES if kind != "list"])
+def test_what_is_no_number_of_an_array_is_refused_or_has_no_effect(tmp_path: Path, kind: str) -> None:
+    """poses_bounds.npy; its last two columns, depths, are not used."""
+    folder = layout("n3dv folders")(tmp_path / "scene")
+    path, whole = folder / "poses_bounds.npy", known(folder)
+    assert isinstance(whole, SourceInfo)
+    for place, rows in spoiled_rows(np.load(path), VALUES[kind]):
+        np.save(path, rows, allow_pickle=True)
+        found = known(folder)
+        if isinstance(found, Exception):
+            assert isinstance(found, SourceError), f"{kind} in column {place}: a traceback: {found!r}"
+            assert str(path) in str(found)
+            assert "\n" not in str(found)
+            continue
+        found.train.validate()
+        found.test.validate()
+        assert kind in NUMBERS or same(found, whole), f"{kind} in column {place}: silently another rig"

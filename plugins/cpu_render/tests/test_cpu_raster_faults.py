@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from cpu_scenes import BACKGROUND, HEIGHT, WIDTH, camera, equal_bits, random_splats, rasterizer, upstream
 from gsstream_cpu_render.arrays import SplatArrays, new_gradients
+from gsstream_cpu_render.by_parts import draw_by_parts
+from gsstream_cpu_render.native import PAIR_BYTES, SPLAT_BYTES
 from gsstream_cpu_render.rasterizer import NumpyRasterizer, render_numpy
 
 from gsstream.api import InputError, ShapeError
@@ -192,3 +194,29 @@ def test_a_limit_that_is_never_met_changes_no_bit() -> None:
     free = render_numpy(splats, viewmat, K, WIDTH, HEIGHT, BACKGROUND)
     bound = render_numpy(splats, viewmat, K, WIDTH, HEIGHT, BACKGROUND, max_memory=1 << 30)
     assert free.tobytes() == bound.tobytes()
+
+
+@pytest.mark.parametrize("most_of_a_part", [30_000_000, 1_000_000, 200_000])
+def test_a_picture_drawn_by_parts_has_the_bits_of_the_whole(most_of_a_part: int) -> None:
+    """Gaussians of all sizes, some of them over every tile: the whole, parts of a few tiles, and single ones."""
+    splats = random_splats(3000, 2, 4)
+    splats.scales[::4] = 2.0
+    viewmat, K = camera()
+    whole, view = (NumpyRasterizer(viewmat, K, 300, 170, BACKGROUND) for _ in range(2))
+    expected, _ = whole.forward(splats)
+    assert draw_by_parts(view, splats, 1 << 30, most_of_a_part).tobytes() == expected.tobytes()
+    if most_of_a_part < 2_000_000 < whole.statistics()["pairs"] * PAIR_BYTES:
+        assert view.memory_bytes() < whole.memory_bytes() / 2
+
+
+def test_parts_end_at_the_limit_on_the_whole_and_a_tile_that_is_too_much_is_refused() -> None:
+    splats = random_splats(400, 2, 4)
+    splats.scales[:] = 2.0
+    viewmat, K = camera()
+    view = NumpyRasterizer(viewmat, K, 300, 170, BACKGROUND)
+    view.forward(splats)
+    whole = view.statistics()["pairs"] * PAIR_BYTES + 400 * SPLAT_BYTES
+    draw_by_parts(view, splats, 2 * whole, 100_000)
+    for most, part in ((0.9 * whole, 100_000), (whole // 3, 100_000), (whole // 100, 100_000), (2 * whole, 10_000)):
+        with pytest.raises(MemoryError, match="cover more tiles of the picture than the limit on memory allows"):
+            draw_by_parts(NumpyRasterizer(viewmat, K, 300, 170, BACKGROUND), splats, int(most), part)

@@ -13,6 +13,7 @@ from gsstream_cpu_render.checks import Float32, first_non_finite, native_array, 
 
 SH_COEFFICIENTS = (1, 4, 9, 16)
 MASK_TILE = 16
+TOO_MANY_PAIRS = "the Gaussians cover more tiles of the picture than the limit on memory allows"
 
 
 class SplatArrays(NamedTuple):
@@ -112,7 +113,7 @@ def raise_on_faults(faults: int, splats: SplatArrays) -> None:
     if not faults:
         return
     if faults & _native.FAULT_PAIRS:
-        raise MemoryError("the Gaussians cover more tiles of the picture than the limit on memory allows")
+        raise MemoryError(TOO_MANY_PAIRS)
     for name, value in splats._asdict().items():
         if found := first_non_finite(name, value):
             refuse(found)

@@ -21,6 +21,7 @@ from gsstream_cpu_render.arrays import (
     require_mask,
     require_splats,
 )
+from gsstream_cpu_render.by_parts import draw_by_parts
 from gsstream_cpu_render.checks import Float32, native_array, refuse
 from gsstream_cpu_render.native import NativeRasterizer, native_scene
 from gsstream_cpu_render.view import NEAR, Background
@@ -43,13 +44,12 @@ def render_numpy(
 
     Raises:
         InputError: wrong shapes, values that are not finite, a quaternion without direction.
-        MemoryError: it would take more than ``max_memory`` bytes, which is known before they are taken.
+        MemoryError: all its tiles would take more than ``max_memory`` bytes at a time. They are drawn in parts where
+            that is much, so that only a bound on the work is left of the limit.
     """
     splats = SplatArrays(*(np.ascontiguousarray(part, np.float32) for part in arrays))
     view = NumpyRasterizer(viewmat=viewmat, K=K, width=width, height=height, background=background, near=near)
-    if max_memory is not None:
-        view.limit_memory(max_memory, len(splats.means))
-    return view.forward(splats)[0]
+    return view.forward(splats)[0] if max_memory is None else draw_by_parts(view, splats, max_memory)
 
 
 class NumpyRasterizer(NativeRasterizer):

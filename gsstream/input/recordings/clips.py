@@ -13,7 +13,14 @@ from PIL import Image
 
 from gsstream.core.errors import SourceError
 from gsstream.input.recordings.base import FilesMissing
-from gsstream.input.recordings.images import PICTURE_FORMATS, UNDECODABLE, is_deep, read_stored, told_apart
+from gsstream.input.recordings.images import (
+    PICTURE_FORMATS,
+    UNDECODABLE,
+    check_unpacked,
+    is_deep,
+    read_stored,
+    told_apart,
+)
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".ts")
@@ -102,7 +109,13 @@ def _opened(path: Path) -> tuple[tuple[int, int], bool]:
     """(width, height) of a picture, and whether it is deep."""
     try:
         with Image.open(path, formats=PICTURE_FORMATS) as image:
-            return image.size, is_deep(path)
+            deep = is_deep(path)
+            check_unpacked(
+                path, image.width * image.height * (6 if deep else 3), "this is no photograph; export it again"
+            )
+            return image.size, deep
+    except SourceError:  # is a ValueError, too
+        raise
     except UNDECODABLE as error:
         raise SourceError(
             f"{path}: the image cannot be opened ({error}); expected PNG or JPEG; {told_apart(path)}"

@@ -10,10 +10,17 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from gsstream.core.errors import SourceError
+from gsstream.core.errors import InputError, SourceError
+from gsstream.core.memory import require_memory
 from gsstream.core.shapes import FloatArray
 from gsstream.core.storage import unpacked
 
+#: Bytes at the peak for every pixel of a file, and of one that is averaged down unevenly, measured.
+PER_PIXEL, PER_AVERAGED = 20, 48
+#: Columns or rows that are averaged at a time: so few stay in a processor's cache.
+_LINES = 32
+#: What unpacks to more than this (bytes, and times its own size) is no recording.
+_UNPACKED, _PACKED = 1 << 26, 100
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _RGB_COLOR_TYPE = b"\x02"
 #: The only decoders that Pillow may try: others are many, some start programs (EPS: Ghostscript), none is documented.
@@ -45,7 +52,8 @@ def read_stored(
     path: Path, size: tuple[int, int], target: tuple[int, int], declared: str = "cameras.json declares"
 ) -> Any:
     """Return what :func:`read_image` does as uint8, of which 255 is 1.0, where that holds it: 8 bits at their size."""
-    pixels, full_scale = _decode(path, size, declared)
+    even = size[0] % target[0] == 0 and size[0] // target[0] == size[1] / target[1]
+    pixels, full_scale = _decode(path, size, declared, PER_PIXEL if even else PER_AVERAGED)
     if pixels.dtype == np.uint8 and target == size:
         return pixels
     return shrink(pixels, target) / np.float32(full_scale)
@@ -71,9 +79,14 @@ def shrink(pixels: np.ndarray[Any, Any], target: tuple[int, int]) -> FloatArray:
             for x in range(step):
                 total += pixels[y::step, x::step]
         return total.astype(np.float32) / np.float32(step * step)
-    lines = _average(pixels.reshape(height, -1), target[1]).reshape(target[1], width, 3)
-    across = _average(lines.transpose(1, 0, 2).reshape(width, -1), target[0])
-    return np.ascontiguousarray(across.reshape(target[0], target[1], 3).transpose(1, 0, 2), np.float32)
+    lines, out = np.empty((target[1], width * 3)), np.empty((target[1], target[0], 3), np.float32)
+    columns = pixels.reshape(height, -1)
+    for at in (slice(first, first + _LINES) for first in range(0, width * 3, _LINES)):
+        lines[:, at] = _average(columns[:, at], target[1])
+    for at in (slice(first, first + _LINES) for first in range(0, target[1], _LINES)):
+        rows = lines[at].reshape(-1, width, 3).transpose(1, 0, 2)
+        out[at] = _average(rows.reshape(width, -1), target[0]).reshape(target[0], -1, 3).transpose(1, 0, 2)
+    return out
 
 
 def _average(lines: np.ndarray[Any, Any], target: int) -> FloatArray:
@@ -88,6 +101,13 @@ def _average(lines: np.ndarray[Any, Any], target: int) -> FloatArray:
     return means
 
 
+def check_unpacked(path: Path, size: int, told: str) -> None:
+    """Raise SourceError for a file that unpacks to far more bytes than it has: ask before unpacking it."""
+    packed = path.stat().st_size
+    if size > max(_UNPACKED, _PACKED * packed):
+        raise SourceError(f"{path}: {packed} bytes unpack to {size}, more than {_PACKED} times as many: {told}")
+
+
 def is_deep(path: Path) -> bool:
     """Say whether an image file holds 16 bits per channel: a PNG may; all others that we read hold 8."""
     head = _head(path)
@@ -99,7 +119,7 @@ def _head(path: Path) -> bytes:
         return file.read(26)
 
 
-def _decode(path: Path, size: tuple[int, int], declared: str) -> tuple[np.ndarray[Any, Any], float]:
+def _decode(path: Path, size: tuple[int, int], declared: str, per_pixel: int) -> tuple[np.ndarray[Any, Any], float]:
     """Pixels [H, W, 3] uint8 or uint16 and the value that means 1.0; none are decoded of a picture of another size."""
     try:
         with Image.open(path, formats=PICTURE_FORMATS) as image:
@@ -108,6 +128,7 @@ def _decode(path: Path, size: tuple[int, int], declared: str) -> tuple[np.ndarra
                     f"{path}: the image is {image.width} x {image.height} pixels, but {declared} {size[0]} x {size[1]};"
                     " correct the declared size (and K with it) or export the frames again"
                 )
+            require_memory(image.width * image.height * per_pixel, f"the picture {path}")
             if is_deep(path) and _head(path)[25:] == _RGB_COLOR_TYPE:
                 return _decode_rgb16(path), 65535.0
             image.load()
@@ -115,7 +136,7 @@ def _decode(path: Path, size: tuple[int, int], declared: str) -> tuple[np.ndarra
             return _to_rgb(path, image)
     except FileNotFoundError as error:
         raise SourceError(f"{path}: the image is missing; every declared frame must exist ({_READABLE})") from error
-    except SourceError:  # is a ValueError, too
+    except InputError:  # is a ValueError, too
         raise
     except UNDECODABLE as error:
         raise SourceError(

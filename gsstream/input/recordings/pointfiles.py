@@ -18,6 +18,7 @@ from gsstream.core.gaussians import SH0
 from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.core.vertices import read_vertices
 from gsstream.input.recordings.base import PointKind
+from gsstream.input.recordings.images import check_unpacked
 from gsstream.input.recordings.sync import RecordingWarning
 
 POINTS_FILE = "points_frame0.npz"
@@ -25,9 +26,6 @@ POINTS_FILE = "points_frame0.npz"
 TRUSTED = 0.5
 #: Steps of float32 above this share of the points' spread move them visibly.
 COARSE = 1e-3
-
-#: An archive that unpacks to more than this (bytes, and times its own size) describes no points.
-_UNPACKED, _PACKED = 1 << 26, 100
 _CHANNELS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 _SPHERICAL = ("f_dc_0", "f_dc_1", "f_dc_2")
 
@@ -94,14 +92,10 @@ def check_archive(path: Path) -> None:
     """Raise SourceError for an archive whose arrays are far larger than the file, before they are unpacked."""
     try:
         with zipfile.ZipFile(path) as archive:
-            size, packed = sum(entry.file_size for entry in archive.infolist()), path.stat().st_size
+            size = sum(entry.file_size for entry in archive.infolist())
     except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):
         return  # whoever reads it says what it is
-    if size > max(_UNPACKED, _PACKED * packed):
-        raise SourceError(
-            f"{path}: {packed} bytes unpack to {size}, more than {_PACKED} times as many: these are no points; "
-            "write the points alone, with numpy.savez"
-        )
+    check_unpacked(path, size, "these are no points; write the points alone, with numpy.savez")
 
 
 def read_ply_points(path: Path) -> PointCloud:

@@ -13,7 +13,8 @@ import numpy as np
 
 from gsstream.core.errors import SourceError
 from gsstream.core.install_hints import install_extra
-from gsstream.input.recordings.images import shrink
+from gsstream.core.memory import require_memory
+from gsstream.input.recordings.images import PER_AVERAGED, shrink
 
 #: The four numbers of a display matrix that turn and mirror: a, b, c, d of :func:`display_matrix`.
 Matrix = tuple[int, int, int, int]
@@ -49,6 +50,7 @@ class VideoClip:
             if not table or context.format is None:
                 raise SourceError(f"{path}: the video holds no pictures; record or copy it again")
             self._stored = (context.width, context.height)
+            require_memory(context.width * context.height * PER_AVERAGED, f"a picture of {path}")
             self._deep = any(component.bits > 8 for component in context.format.components)
         if any(pts is None for pts, *_ in table):
             raise SourceError(

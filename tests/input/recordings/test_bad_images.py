@@ -4,19 +4,28 @@ from __future__ import annotations
 
 import json
 import shutil
+import struct
 import warnings
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from gsstream.core.errors import EndOfRecording, SourceError
+from gsstream.core.errors import EndOfRecording, InputError, SourceError
+from gsstream.core.memory import limited_memory
+from gsstream.input.prepare.raw import find_cameras
 from gsstream.input.recordings.base import Wrapped
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
 from gsstream.input.recordings.options import DataOptions
 from gsstream.input.recordings.sync import RecordingWarning
 from gsstream.input.recordings.transformed import transformed
+from gsstream.input.recordings.video import VideoClip
+from tests.input.recordings.scenes import write_video
+from tests.input.test_doors import bomb, chunk
 
 WORLD = "synthetic:frames=12&views=4&width=16&height=12&supersample=1&motion=3"
 
@@ -59,6 +68,81 @@ def test_a_bad_image_is_repeated_or_its_frame_dropped(policy, damaged) -> None:
         assert len(test.cameras) == len(test.images) == (0 if index == 5 else len(whole.info.test))
         words = " ".join(str(w.message) for w in told if issubclass(w.category, RecordingWarning))
         assert (f"frame {index}, camera" in words) == (bad or index == 5)
+
+
+def header(side: int, depth: int, colour: int) -> Callable[[Path], None]:
+    """A picture of this many pixels, as its header says, and none behind it."""
+    first = struct.pack(">IIBBBBB", side, side, depth, colour, 0, 0, 0)
+    data = chunk(b"IHDR", first) + chunk(b"IDAT", zlib.compress(b"\0")) + chunk(b"IEND", b"")
+    return lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n" + data) and None
+
+
+def packed_chunk(kind: bytes) -> Callable[[Path], None]:
+    def change(path: Path) -> None:
+        Image.open(path).save(path, format="PNG")
+        bomb(kind, b"k\0\0")(path)
+
+    return change
+
+
+BOMBS = {
+    "text": packed_chunk(b"zTXt"),
+    "profile": packed_chunk(b"iCCP"),
+    "13,000 x 13,000": header(13_000, 8, 2),
+    "20,000 x 20,000": header(20_000, 8, 6),
+    "of 16 bits": header(20_000, 16, 2),
+    "grey, of 16 bits": header(12_000, 16, 0),
+}
+
+
+@pytest.mark.parametrize("kind", BOMBS)
+@pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
+def test_a_picture_that_unpacks_to_much_is_passed_over_as_any_bad_image(kind: str, tmp_path: Path) -> None:
+    folder = tmp_path / "demo"
+    shutil.copytree(DEMO_FOLDER, folder)
+    camera = json.loads((folder / "cameras.json").read_text())["cameras"][0]
+    BOMBS[kind](folder / (camera["frames"] % 3))
+    whole, source = open_source("demo"), transformed(open_source(str(folder)), DataOptions(bad_image="repeat"))
+    with pytest.warns(RecordingWarning, match="frame 3, camera"):
+        frame = source.frame(3)
+    row = frame.cameras.ids.index(camera["id"])
+    assert np.array_equal(frame.images[row], whole.frame(2).images[row])
+    with pytest.raises(SourceError, match="000003"):
+        transformed(open_source(str(folder)), DataOptions()).frame(3)
+
+
+@pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
+def test_first_pictures_that_are_no_photographs_are_refused_by_their_headers(tmp_path: Path) -> None:
+    """Where no file states a size, the first picture does: 75 MB of pixels are fine, in a file of a hundredth."""
+    for name in ("cam_0", "cam_1"):
+        (tmp_path / name).mkdir()
+        header(5_000, 8, 2)(tmp_path / name / "000000.png")
+    with pytest.raises(SourceError, match=r"000000\.png: 66 bytes unpack to 75000000, more than 100 times as many"):
+        find_cameras(tmp_path)
+    for path in tmp_path.glob("*/*.png"):
+        path.write_bytes(path.read_bytes() + bytes(750_000))
+    assert [camera.size for camera in find_cameras(tmp_path)[0]] == [(5_000, 5_000)] * 2
+
+
+def test_pictures_ask_how_much_memory_they_may_take() -> None:
+    """160 x 120 pixels, of which each takes 20 bytes, and 48 where they are averaged down unevenly."""
+    for scale, least in ((1.0, 0.384), (0.5, 0.384), (0.3, 0.922)):
+        source = open_source("demo", scale)
+        with limited_memory(int(least * 1e6) + 1000):
+            source.frame(0)
+        with (
+            limited_memory(int(least * 1e6) - 1000),
+            pytest.raises(InputError, match=rf"the picture .*000000.* takes about {least} MB; the limit is .* Raise"),
+        ):
+            source.frame(0)
+
+
+def test_videos_ask_how_much_memory_they_may_take(tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    write_video(tmp_path / "cam_0.mkv", np.zeros((2, 120, 160, 3), np.uint8))
+    VideoClip(tmp_path / "cam_0.mkv")
+    with limited_memory(900_000), pytest.raises(InputError, match=r"a picture of .*cam_0.mkv takes about 0.922 MB"):
+        VideoClip(tmp_path / "cam_0.mkv")
 
 
 def test_frame_0_needs_every_image(damaged) -> None:

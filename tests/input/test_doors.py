@@ -307,3 +307,32 @@ def test_a_huge_picture_in_place_of_a_frame_is_refused_before_it_is_decoded(mode
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         told = asked(by_run, path.parents[1]).refused
     assert "000005.png: the image is 13000 x 13000 pixels, but the first image of its camera has 160 x 120" in told
+
+
+def slipped(folder: Path) -> None:
+    """Camera cam02 shows picture 4 and all that follow three frames late, as a phone that slows down writes it."""
+    import av
+
+    path, out = folder / "cam02.mp4", folder / "slipped.mp4"
+    with av.open(str(path)) as file, av.open(str(out), "w") as copy:
+        stream = copy.add_stream_from_template(file.streams.video[0])
+        packets = [packet for packet in file.demux(video=0) if packet.size]
+        step = packets[1].pts - packets[0].pts
+        for number, packet in enumerate(packets):
+            packet.pts = packet.dts = packets[0].pts + step * (number + (3 if number >= 4 else 0))
+            packet.stream = stream
+            copy.mux(packet)
+    out.replace(path)
+
+
+def test_a_variable_rate_is_told_by_every_door_and_moves_no_picture(tmp_path: Path) -> None:
+    even = by_run(films(tmp_path / "even", {}))
+    folder = films(tmp_path / "slipped", {}, slipped)
+    told = r"cam02: time stamps are uneven: frame 4 comes \+3\.0 frames off"
+    for door in (by_run, by_prepare, by_prepare_alone):
+        with pytest.warns(UserWarning, match=told):
+            seen = door(folder)
+        assert seen.fps == 25
+        assert all(np.array_equal(seen.pictures[camera], even.pictures[camera]) for camera in IDS)
+    with pytest.warns(UserWarning, match=told):
+        assert "files" not in by_validate(folder)

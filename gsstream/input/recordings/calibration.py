@@ -21,9 +21,9 @@ from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.rigs.camera import opencv_lens
 
 SCHEMA = "opencv-multiview-1"
-#: Largest picture side, number of frames, and lengths of a text and of a pattern that a file may state. They are
-#: checked before any memory is allocated and any file is opened.
-MAX_FRAMES, MAX_TEXT, MAX_PATTERN = 10_000_000, 1 << 20, 1000
+#: Largest numbers of frames and cameras, and lengths of a text and of a pattern that a file may state. They are checked
+#: before any memory is allocated and any file is opened.
+MAX_FRAMES, MAX_CAMERAS, MAX_TEXT, MAX_PATTERN = 10_000_000, 10_000, 1 << 20, 1000
 CALIBRATION_FILE = "cameras.json"
 _KEYS = Keys(
     read="schema name fps frames test_cameras licence cameras",
@@ -70,6 +70,8 @@ def read_calibration(folder: Path, *, growing: bool = False, any_sizes: bool = F
     cameras = data.get("cameras")
     if not isinstance(cameras, list) or not cameras or not all(isinstance(c, dict) for c in cameras):
         raise SourceError(f"{path}: 'cameras' must be a non-empty list of objects, got {brief(cameras)}")
+    if len(cameras) > MAX_CAMERAS:
+        raise SourceError(f"{path}: expected at most {MAX_CAMERAS} cameras, got {len(cameras)}")
     check_keys(str(path), [data], _KEYS)
     check_keys(f"{path}: cameras", cameras, _CAMERA_KEYS)
     ids = [_camera_id(path, camera, index) for index, camera in enumerate(cameras)]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Any
@@ -44,13 +44,14 @@ def check_keys(where: str, found: Iterable[Mapping[str, Any]], known: Keys) -> N
     unknown: dict[str, None] = {}
     read, idle, refused = known.read.split(), known.idle.split(), known.refused.split()
     spelled = {_bare(key): key for key in read if not key.endswith("*")}
+    fine, bad = _test(read + idle), _test(refused)
     for entry in found:
         for key, value in entry.items():
-            if _fits(key, refused):
+            if bad(key):
                 if _says(value):
                     told = f"{where}: {key!r} is not supported, and says how to read the file, got {brief(value)}"
                     raise SourceError(f"{told}: export without this key, or undistort the pictures")
-            elif not _fits(key, read) and not _fits(key, idle):
+            elif not fine(key):
                 if near := spelled.get(_bare(key)):
                     raise SourceError(f"{where}: the key {key!r} is not known; did you mean {near!r}?")
                 unknown[key] = None
@@ -62,8 +63,11 @@ def check_keys(where: str, found: Iterable[Mapping[str, Any]], known: Keys) -> N
         warn(f"{where}: keys that are not known have no effect: {told}{near}")
 
 
-def _fits(key: str, names: Sequence[str]) -> bool:
-    return any(key.startswith(name[:-1]) if name.endswith("*") else key == name for name in names)
+def _test(names: Sequence[str]) -> Callable[[str], bool]:
+    """Whether a key is one of these names."""
+    whole = frozenset(names)
+    beginnings = tuple(name[:-1] for name in names if name.endswith("*"))
+    return lambda key: key in whole or key.startswith(beginnings)
 
 
 def _bare(key: str) -> str:

@@ -13,6 +13,8 @@ from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.clips import natural_sort_key
 
+#: Elements of poses that differ by less, beside a share of 1e-5, are those of one camera.
+_NEAR = 1e-9
 Entry = dict[str, Any]
 Pose = Callable[[Path, Entry], FloatArray]
 #: Keys of an entry that say how its camera sees.
@@ -31,13 +33,13 @@ def group_entries(path: Path, frames: list[Entry], pose: Pose) -> dict[str, list
     Raises SourceError for a camera that moves, and for cameras that are not all there at all times.
     """
     by_folder: dict[str, list[Entry]] = {}
-    for frame in frames:
-        by_folder.setdefault(str(PurePosixPath(frame["file_path"]).parent), []).append(frame)
-    still = all(
-        np.allclose(pose(path, entry), pose(path, entries[0]), atol=1e-9)
-        for entries in by_folder.values()
-        for entry in entries
-    )
+    poses, first = np.stack([pose(path, frame) for frame in frames]), dict[str, int]()
+    firsts = []
+    for i, frame in enumerate(frames):
+        folder = str(PurePosixPath(frame["file_path"]).parent)
+        by_folder.setdefault(folder, []).append(frame)
+        firsts.append(first.setdefault(folder, i))
+    still = np.allclose(poses, poses[firsts], atol=_NEAR)
     if still and len(by_folder) > 1:
         names = [PurePosixPath(folder).name for folder in by_folder]
         if len(set(names)) < len(names):
@@ -45,7 +47,7 @@ def group_entries(path: Path, frames: list[Entry], pose: Pose) -> dict[str, list
         cameras = dict(zip(names, by_folder.values(), strict=True))
         timed = max(map(len, cameras.values())) > 1 and all("time" in frame for frame in frames)
         return _checked(path, cameras) if timed else _sorted(cameras)
-    groups = _by_pose(path, frames, pose)
+    groups = _by_pose(frames, poses)
     times = {_time(path, frame) for frame in frames if "time" in frame}
     sizes = {len(entries) for entries in groups}
     if len(times) > 1:
@@ -93,20 +95,25 @@ def _checked(path: Path, cameras: dict[str, list[Entry]]) -> dict[str, list[Entr
     return _sorted(cameras)
 
 
-def _by_pose(path: Path, frames: list[Entry], pose: Pose) -> list[list[Entry]]:
+def _by_pose(frames: list[Entry], poses: FloatArray) -> list[list[Entry]]:
     """Entries whose pose and intrinsics agree, in the order of the file."""
-    groups: list[list[Entry]] = []
-    poses: list[FloatArray] = []
-    for frame in frames:
-        own = pose(path, frame)
-        same = (i for i, other in enumerate(poses) if np.allclose(own, other, atol=1e-9))
-        found = next((i for i in same if _lens(groups[i][0]) == _lens(frame)), None)
+    # Thousands of poses are told apart by one number each; what is left is compared.
+    flat = poses.reshape(len(poses), -1)
+    weights = np.sqrt(np.arange(flat.shape[1]) + 2)
+    keys, slack = flat @ weights, (_NEAR + 1e-5 * np.abs(flat)) @ weights
+    groups: list[list[int]] = []
+    firsts = np.zeros(len(frames), np.int64)
+    for i, frame in enumerate(frames):
+        known = firsts[: len(groups)]
+        near = np.flatnonzero(np.abs(keys[known] - keys[i]) <= slack[known])
+        same = near[np.isclose(flat[i], flat[known[near]], atol=_NEAR).all(1)]
+        found = next((g for g in same if _lens(frames[firsts[g]]) == _lens(frame)), None)
         if found is None:
-            groups.append([frame])
-            poses.append(own)
+            firsts[len(groups)] = i
+            groups.append([i])
         else:
-            groups[found].append(frame)
-    return groups
+            groups[found].append(i)
+    return [[frames[i] for i in group] for group in groups]
 
 
 def _lens(entry: Entry) -> list[Any]:

@@ -23,6 +23,7 @@ from gsstream.input.recordings.clips import ImageClip
 from gsstream.input.recordings.images import read_image
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
 from gsstream.input.recordings.pointfiles import read_points
+from tests.input.hostile_inputs import measured
 
 
 @pytest.fixture
@@ -205,3 +206,32 @@ def test_a_picture_that_viewers_turn_is_read_as_stored_and_that_is_said(kind, tm
     with pytest.warns(UserWarning, match="EXIF orientation 6"):
         turned = read_image(tmp_path / "6.x", (8, 6), (8, 6))
     assert (turned == upright).all()
+
+
+def test_a_message_stays_short_whatever_an_archive_holds(tmp_path: Path) -> None:
+    np.savez(tmp_path / "p.npz", **{f"array_{i}": np.zeros(1) for i in range(500)})
+    with pytest.raises(SourceError, match=r"no array 'xyz' for points 'recording'; it holds .*array_0") as told:
+        read_points(tmp_path / "p.npz", "recording")
+    assert len(str(told.value)) < 300
+
+
+def test_more_cameras_than_a_rig_has_are_refused_before_they_are_read(tmp_path: Path) -> None:
+    data = {"frames": 1, "cameras": [{"id": 5}] * 10_001}
+    (tmp_path / "cameras.json").write_text(json.dumps(data))
+    with pytest.raises(SourceError, match=r"cameras\.json: expected at most 10000 cameras, got 10001"):
+        open_source(str(tmp_path))
+
+
+@pytest.fixture(scope="module")
+def honest() -> float:
+    """Peak of memory of the command on the demo, MB."""
+    return measured("the demo, as it is")[1]
+
+
+@pytest.mark.parametrize("name", ["PNG whose data unpack to 500 MB", "text chunk of 200 MB", "recipe of 5 MB"])
+def test_a_hostile_input_takes_no_more_memory_than_an_honest_one(name: str, honest: float) -> None:
+    """A command on each; all others of the list are run by hand, since writing them takes minutes."""
+    code, memory, _, text = measured(name)
+    assert code == 2
+    assert "Traceback" not in text
+    assert memory < honest + 40

@@ -205,8 +205,12 @@ INPUTS: dict[str, Hostile] = {
     "PNG whose data unpack to 500 MB": picture(lambda p: png(p, (160, 120), data=zeros(500 << 20))),
     "PNG of 16 bits whose data unpack to 500 MB": picture(lambda p: png(p, (160, 120), 16, data=zeros(500 << 20))),
     "10,000 pictures of an animation": picture(
-        lambda p: png(p, (160, 120), more=chunk(b"acTL", struct.pack(">II", 10_000, 0)) + chunk(
-            b"fcTL", struct.pack(">IIIIIHHBB", 0, 160, 120, 0, 0, 1, 1, 0, 0)) * 10_000)
+        lambda p: png(
+            p,
+            (160, 120),
+            more=chunk(b"acTL", struct.pack(">II", 10_000, 0))
+            + chunk(b"fcTL", struct.pack(">IIIIIHHBB", 0, 160, 120, 0, 0, 1, 1, 0, 0)) * 10_000,
+        )
     ),
     "half a picture": picture(lambda p: p.write_bytes(next(DEMO_FOLDER.glob("*/*.jpg")).read_bytes()[:900]) and None),
     "PostScript for a picture": picture(lambda p: p.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n") and None),
@@ -223,7 +227,7 @@ INPUTS: dict[str, Hostile] = {
     "points of 10^12 rows of no bytes": points(
         archive({"xyz.npy": array((HUGE, 3), "|V0"), "rgb.npy": array((HUGE, 3), "|u1")})
     ),
-    "one array for points": points(lambda p: p.write_bytes(array((HUGE, 3), "<f8"))  and None),
+    "one array for points": points(lambda p: p.write_bytes(array((HUGE, 3), "<f8")) and None),
     "pickled points": points(archive({"xyz.npy": array((1,), "|O", b"cos\nsystem\n"), "rgb.npy": b""})),
     "100,000 arrays of points": points(archive({f"{i}.npy": b"" for i in range(100_000)})),
     "PLY that announces 10^12 points": still(ply(HUGE, bytes(12))),
@@ -244,7 +248,7 @@ INPUTS: dict[str, Hostile] = {
     "recipe of 5,000 brackets": recipe("a: " + "[" * 5_000 + "]" * 5_000 + "\n"),
     "recipe of 5 MB": recipe("a: " + "x" * 5_000_000 + "\n"),
     "recipe of 200,000 keys": recipe("".join(f"k{i}: 1\n" for i in range(200_000))),
-}  # fmt: skip
+}
 
 
 #: A small process, since a child counts the memory of the one that started it as its own.

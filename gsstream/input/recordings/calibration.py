@@ -16,7 +16,7 @@ from gsstream.core.install_hints import page
 from gsstream.core.names import check_camera_ids
 from gsstream.input.recordings.base import Split
 from gsstream.input.recordings.clips import VIDEO_SUFFIXES, prepare_command
-from gsstream.input.recordings.foreign import MAX_NUMBER, MAX_SIDE, Keys, brief, check_keys, matrix
+from gsstream.input.recordings.foreign import MAX_NUMBER, MAX_SIDE, Keys, brief, check_keys, matrix, number
 from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.rigs.camera import opencv_lens
 
@@ -89,7 +89,9 @@ def read_calibration(folder: Path, *, growing: bool = False, any_sizes: bool = F
     lenses = {i: _lens(path, i, camera) for i, camera in zip(ids, cameras, strict=True)}
     return Calibration(
         name=_text(path, "name", data.get("name", folder.name), MAX_PATTERN),
-        fps=_positive(path, "fps", data.get("fps", 30.0)),
+        fps=number(
+            str(path), "'fps'", data.get("fps", 30.0), above=0, below=1e6, expected="a positive number below a million"
+        ),
         num_frames=0 if uncounted else _count(path, data.get("frames")),
         licence=_text(path, "licence", data.get("licence", ""), MAX_TEXT),
         train=rig.select(train),
@@ -264,9 +266,3 @@ def _text(path: Path, key: str, value: Any, most: int) -> str:
     if path.parent.name != text and any("\ud800" <= sign <= "\udfff" for sign in text):
         raise SourceError(f"{path}: {key!r} holds half of a character (a lone surrogate); write it as UTF-8")
     return text
-
-
-def _positive(path: Path, key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 1e6:
-        raise SourceError(f"{path}: {key!r} must be a positive number below a million, got {brief(value)}")
-    return float(value)

@@ -18,7 +18,6 @@ from gsstream.core.gaussians import SH0
 from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.core.vertices import read_vertices
 from gsstream.input.recordings.base import PointKind
-from gsstream.input.recordings.foreign import brief
 from gsstream.input.recordings.images import check_unpacked
 from gsstream.input.recordings.sync import RecordingWarning
 
@@ -45,7 +44,9 @@ def read_points(path: Path, kind: PointKind) -> PointCloud:
             names = list(arrays.files)
             missing = [n for n in (f"{prefix}xyz", f"{prefix}rgb") if n not in names]
             if missing:
-                raise SourceError(f"{path}: no array {missing[0]!r} for points {kind!r}; it holds {brief(names)}")
+                raise SourceError(
+                    f"{path}: no array {missing[0]!r} for points {kind!r}; it holds {', '.join(names[:12])}"
+                )
             xyz, rgb = arrays[f"{prefix}xyz"], arrays[f"{prefix}rgb"]
             trust = arrays[f"{prefix}confidence"] if f"{prefix}confidence" in names else None
     except SourceError:

@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 
 from gsstream.core.errors import SourceError
-from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, folder_clip, images_in
-from gsstream.input.recordings.foreign import Keys, check_keys, inside, left_out, parsed, pixels
+from gsstream.input.recordings.foreign import Keys, check_keys, inside, left_out, pixels
 from gsstream.input.recordings.poses import from_pixel_centers, from_rotation_vector
 from gsstream.input.recordings.recorded import Recording
 from gsstream.input.recordings.rigs.camera import RigCamera, assembled_rig, opencv_lens
-from gsstream.input.recordings.rigs.opencv_yaml import load_storage
+from gsstream.input.recordings.rigs.opencv_yaml import load_storage, numbers_of
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
 #: Keys that EasyMocap and EasyVolcap write; near and far planes, bounds and colour matrices belong to rendering.
@@ -76,25 +75,19 @@ def _camera(
     if f"K_{name}" not in intri or f"T_{name}" not in extri or not turns:
         return None
     inner, outer = str(folder / INTRINSICS), str(folder / EXTRINSICS)
-    turn = _numbers(outer, extri, turns[0], 9 if turns[0].startswith("Rot") else 3)
+    turn = numbers_of(outer, extri, turns[0], counts=(9 if turns[0].startswith("Rot") else 3,))
     w2c = np.eye(4)
     w2c[:3, :3] = from_rotation_vector(turn) if len(turn) == 3 else turn.reshape(3, 3)
-    w2c[:3, 3] = _numbers(outer, extri, f"T_{name}", 3)
+    w2c[:3, 3] = numbers_of(outer, extri, f"T_{name}", counts=(3,))
     bent = next((key for key in (f"dist_{name}", f"D_{name}") if key in intri), None)
-    coefficients = [] if bent is None else _numbers(inner, intri, bent).tolist()
+    coefficients = [] if bent is None else numbers_of(inner, intri, bent).tolist()
     stated = [key for key in (f"W_{name}", f"H_{name}") if key in intri]
-    sides = [pixels(inner, key, float(_numbers(inner, intri, key, 1)[0])) for key in stated]
+    sides = [pixels(inner, key, float(numbers_of(inner, intri, key, counts=(1,))[0])) for key in stated]
     return RigCamera(
         name=name,
         w2c=w2c,
-        K=from_pixel_centers(_numbers(inner, intri, f"K_{name}", 9).reshape(3, 3)),
+        K=from_pixel_centers(numbers_of(inner, intri, f"K_{name}", counts=(9,)).reshape(3, 3)),
         lens=opencv_lens(coefficients, False, f"{inner}: {bent}"),
         size=(sides[0], sides[1]) if len(sides) == 2 else pictures,
         border=0,
     )
-
-
-def _numbers(where: str, data: dict[str, Any], key: str, *counts: int) -> FloatArray:
-    entry = data[key]
-    values = entry.get("data", ()) if isinstance(entry, dict) else entry
-    return parsed(where, key, values if isinstance(values, list) else [values], *counts)

@@ -25,7 +25,7 @@ INTRINSICS = (
 
 
 def group_entries(path: Path, frames: list[Entry], pose: Pose) -> dict[str, list[Entry]]:
-    """Return camera id -> its entries, in the order of ``time``, else of names.
+    """Return camera id -> its entries, in the order of ``time`` (numbers, where they are there), else of names.
 
     One folder per camera with one pose each; else entries of one pose and one set of intrinsics, where ``time`` (or
     equal numbers of them) says that they are a recording; else one camera per entry, a still scene.
@@ -48,7 +48,7 @@ def group_entries(path: Path, frames: list[Entry], pose: Pose) -> dict[str, list
         timed = max(map(len, cameras.values())) > 1 and all("time" in frame for frame in frames)
         return _checked(path, cameras) if timed else _sorted(cameras)
     groups = _by_pose(frames, poses)
-    times = {_time(path, frame) for frame in frames if "time" in frame}
+    times = {_time(frame) for frame in frames if "time" in frame}
     sizes = {len(entries) for entries in groups}
     if len(times) > 1:
         return _timed(path, groups, len(times))
@@ -80,9 +80,9 @@ def _timed(path: Path, groups: list[list[Entry]], instants: int) -> dict[str, li
 
 def _checked(path: Path, cameras: dict[str, list[Entry]]) -> dict[str, list[Entry]]:
     """The cameras, once each of them has one picture of every time that any of them has."""
-    every = {_time(path, entry) for entries in cameras.values() for entry in entries}
+    every = {_time(entry) for entries in cameras.values() for entry in entries}
     for name, entries in cameras.items():
-        own = [_time(path, entry) for entry in entries]
+        own = [_time(entry) for entry in entries]
         if len(set(own)) < len(own):
             twice = next(time for time in own if own.count(time) > 1)
             raise SourceError(f"{path}: camera {name!r} has two pictures of time {twice:g}; take one of them out")
@@ -142,12 +142,9 @@ def _sorted(cameras: dict[str, list[Entry]]) -> dict[str, list[Entry]]:
     return dict(sorted(ordered.items(), key=lambda item: natural_sort_key(Path(item[0]))))
 
 
-def _time(path: Path, entry: Entry) -> float:
-    value = entry.get("time", 0.0)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise SourceError(f"{path}: time of {entry['file_path']!r} must be a finite number, got {value!r}")
-    return float(value)
+def _time(entry: Entry) -> float:
+    return float(entry.get("time", 0.0))
 
 
 def _when(entry: Entry) -> tuple[float, list[tuple[int, str]]]:
-    return float(entry.get("time", 0.0)), natural_sort_key(Path(entry["file_path"]))
+    return _time(entry), natural_sort_key(Path(entry["file_path"]))

@@ -50,15 +50,15 @@ def read(path: Path, text: str) -> list[RigCamera]:
     data, where = load_storage(path), str(path)
     check_keys(where, [data], _KEYS)
     rotation, translation = (
-        _numbers(where, data, "R", "rvec", "Rot", counts=(3, 9)),
-        _numbers(where, data, "T", "tvec", counts=(3,)),
+        numbers_of(where, data, "R", "rvec", "Rot", counts=(3, 9)),
+        numbers_of(where, data, "T", "tvec", counts=(3,)),
     )
     w2c = None
     if len(rotation) and len(translation):
         w2c = np.eye(4)
         w2c[:3, :3] = from_rotation_vector(rotation) if len(rotation) == 3 else rotation.reshape(3, 3)
         w2c[:3, 3] = translation
-    coefficients = _numbers(where, data, "distortion_coefficients", "distortion", "D", "dist")
+    coefficients = numbers_of(where, data, "distortion_coefficients", "distortion", "D", "dist")
     model = str(data.get("model", data.get("distortion_model", ""))).lower()
     if model not in (*_FISHEYE, *_BROWN):
         raise SourceError(
@@ -69,12 +69,15 @@ def read(path: Path, text: str) -> list[RigCamera]:
     if not all(side.isdigit() for side in sides):
         raise SourceError(f"{path}: expected image_width and image_height in pixels, got {sides}")
     size = pixels(where, "image_width", int(sides[0])), pixels(where, "image_height", int(sides[1]))
-    K = _numbers(where, data, "camera_matrix", "K", counts=(9,)).reshape(3, 3)
+    K = numbers_of(where, data, "camera_matrix", "K", counts=(9,)).reshape(3, 3)
     return [RigCamera(name=path.stem, w2c=w2c, K=from_pixel_centers(K), lens=lens, size=size)]
 
 
-def _numbers(where: str, data: dict[str, Any], *keys: str, counts: tuple[int, ...] = ()) -> FloatArray:
-    """The matrix under the first of some keys that is there, flat; empty where none is."""
+def numbers_of(where: str, data: dict[str, Any], *keys: str, counts: tuple[int, ...] = ()) -> FloatArray:
+    """Return the matrix under the first of some keys that is there, flat; empty where none is.
+
+    Raises SourceError for what is no number, and for as many as none of ``counts``.
+    """
     key = next((key for key in keys if key in data), None)
     if key is None:
         return np.zeros(0)

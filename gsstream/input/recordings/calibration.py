@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.errors import ShapeError, SourceError
+from gsstream.core.errors import InputError, ShapeError, SourceError
 from gsstream.core.install_hints import page
+from gsstream.core.memory import require_memory
 from gsstream.core.names import check_camera_ids
 from gsstream.input.recordings.base import Split
 from gsstream.input.recordings.clips import VIDEO_SUFFIXES, prepare_command
@@ -24,6 +25,8 @@ SCHEMA = "opencv-multiview-1"
 #: Largest numbers of frames and cameras, and lengths of a text and of a pattern that a file may state. They are checked
 #: before any memory is allocated and any file is opened.
 MAX_FRAMES, MAX_CAMERAS, MAX_TEXT, MAX_PATTERN = 10_000_000, 10_000, 1 << 20, 1000
+#: Bytes of memory for every byte of JSON; lists of empty objects are worst.
+PER_BYTE = 30
 CALIBRATION_FILE = "cameras.json"
 _KEYS = Keys(
     read="schema name fps frames test_cameras licence cameras",
@@ -110,7 +113,10 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def _parse_json(path: Path, absent: str = "") -> Any:
     try:
+        require_memory(path.stat().st_size * PER_BYTE, f"reading {path}")
         return json.loads(path.read_text(encoding="utf-8"))
+    except InputError:  # is a ValueError, too
+        raise
     except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, numbers of thousands of digits, deep nesting
         raise SourceError(f"{path}: not valid JSON: {error}") from error
     except OSError as error:

@@ -8,6 +8,7 @@ import re
 import shutil
 import stat
 import time
+import tracemalloc
 import warnings
 import zipfile
 from pathlib import Path
@@ -17,8 +18,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsstream.core.errors import SourceError
+from gsstream.core.errors import InputError, SourceError
+from gsstream.core.memory import limited_memory
 from gsstream.input.prepare.raw import find_cameras
+from gsstream.input.recordings.calibration import PER_BYTE, read_calibration, read_json
 from gsstream.input.recordings.clips import ImageClip
 from gsstream.input.recordings.images import read_image
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
@@ -220,6 +223,25 @@ def test_more_cameras_than_a_rig_has_are_refused_before_they_are_read(tmp_path: 
     (tmp_path / "cameras.json").write_text(json.dumps(data))
     with pytest.raises(SourceError, match=r"cameras\.json: expected at most 10000 cameras, got 10001"):
         open_source(str(tmp_path))
+
+
+def test_the_json_of_a_calibration_asks_how_much_memory_it_may_take(folder: Path) -> None:
+    size = (folder / "cameras.json").stat().st_size
+    with limited_memory(31 * size):
+        read_calibration(folder)
+    with limited_memory(29 * size), pytest.raises(InputError, match=r"reading .*cameras\.json takes about .* Raise"):
+        read_calibration(folder)
+
+
+def test_the_worst_json_takes_no_more_than_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "worst.json"
+    path.write_text('{"a": [' + "{}," * 100_000 + "{}]}")
+    tracemalloc.start()
+    try:
+        read_json(path)
+        assert tracemalloc.get_traced_memory()[1] < PER_BYTE * path.stat().st_size
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ SHIPPED = {
     "gsstream-gsplat-render": "gsplat", "gsstream-ft-pruning": "ft-pruning", "gsstream-binary-ste": "binary-ste",
     "gsstream-onnx-confidence": "onnx", "gsstream-hicom": "hicom", "gsstream-comgs": "comgs",
     "gsstream-stream3dgs": "stream3dgs", "gsstream-recon": "recon", "gsstream-quarc": "quarc",
-    "gsstream-lab": "lab",
+    "gsstream-lab": "lab", "gsstream-capture": "capture",
 }  # fmt: skip
 INSTALLED = [plugin.distribution for plugin in load_catalog().plugins if plugin.distribution in SHIPPED]
 

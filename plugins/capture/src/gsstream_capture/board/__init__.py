@@ -1,0 +1,1 @@
+"""Calibration of a rig with a printed board."""

@@ -1,0 +1,78 @@
+"""The folder that ``gsstream run --source watch:DIR?ready=rename`` follows: cameras.json, pictures by rename, END."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gsstream.core.errors import OutputError
+from gsstream.input.recordings.calibration import CALIBRATION_FILE, SCHEMA
+from gsstream_capture.pictures import CameraPlan
+
+#: Free bytes of the disk below which instants are dropped, and below which the capture ends.
+LOW, FULL = 1_000_000_000, 100_000_000
+LOG, END = "capture.jsonl", "END"
+
+
+class FolderWriter:
+    """Writes instants; a picture is there whole or not at all. Raises OutputError for a folder that holds something."""
+
+    def __init__(self, out: Path, plans: Sequence[CameraPlan], fps: float, *, more: Mapping[str, Any]) -> None:
+        self._out, self._plans, self.frames = out, plans, 0
+        claim(out)
+        for plan in plans:
+            (out / plan.name).mkdir()
+        cameras = [
+            {
+                "id": plan.name,
+                "width": plan.size[0],
+                "height": plan.size[1],
+                "K": plan.K.tolist(),
+                "w2c": plan.w2c.tolist(),
+                "frames": f"{plan.name}/%06d.jpg",
+                "split": plan.split,
+            }
+            for plan in plans
+        ]
+        text = json.dumps({"schema": SCHEMA, "fps": fps, **more, "cameras": cameras}, indent=1)
+        self._put(out / CALIBRATION_FILE, text.encode())
+        self._log = (out / LOG).open("a", encoding="utf-8")
+
+    @property
+    def free(self) -> int:
+        """Bytes that the disk has left."""
+        return shutil.disk_usage(self._out).free
+
+    def add(self, pictures: Mapping[int, bytes], told: Mapping[str, Any]) -> None:
+        """Write one instant: files by camera, and its line of the log."""
+        for number, data in pictures.items():
+            self._put(self._out / self._plans[number].name / f"{self.frames:06d}.jpg", data)
+        self._log.write(json.dumps({"frame": self.frames, **told}) + "\n")
+        self._log.flush()
+        self.frames += 1
+
+    def end(self) -> None:
+        """Say that nothing more will come."""
+        self._log.close()
+        (self._out / END).touch()
+
+    def _put(self, path: Path, data: bytes) -> None:
+        part = path.with_name(f"{path.name}.part")
+        try:
+            part.write_bytes(data)
+            part.replace(path)
+        except OSError as error:
+            raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+def claim(out: Path) -> None:
+    """Make an empty folder, or take one. Raises OutputError where it holds something or cannot be made."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if any(out.iterdir()):
+            raise OutputError(f"{out} is not empty; expected a new folder, choose another --out")
+    except OSError as error:
+        raise OutputError(f"the folder {out} cannot be used: {error.strerror or error}") from error

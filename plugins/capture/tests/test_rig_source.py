@@ -62,7 +62,7 @@ def test_closing_ends_the_capture(films, tmp_path) -> None:
         ("rig:RIG?behid=drop", "unknown option 'behid'; did you mean 'behind'"),
         ("rig:RIG?folder=FULL", "is not empty"),
         ("rig:absent.yaml", "cannot be read"),
-        ("rig:BARE", "has no 'calibration'"),
+        ("rig:BARE", "calibrate first: gsstream calibrate board"),
     ],
 )
 def test_what_cannot_be_captured_is_said(films, tmp_path, uri, message) -> None:

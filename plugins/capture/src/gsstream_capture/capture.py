@@ -121,7 +121,7 @@ def _state(reader: CameraReader) -> str:
 def calibration_of(rig: Rig) -> tuple[Calibration, Path]:
     """Return the calibration of a rig's cameras and its file. Raises SourceError where there is none, or one lacks."""
     if rig.calibration is None:
-        raise SourceError("the rig file has no 'calibration'; name a cameras.json with lenses and poses of its cameras")
+        raise SourceError("the rig file has no 'calibration'; calibrate first: gsstream calibrate board")
     path = rig.calibration / CALIBRATION_FILE if rig.calibration.is_dir() else rig.calibration
     if path.name != CALIBRATION_FILE:
         raise SourceError(f"{path}: expected a file of the name {CALIBRATION_FILE}, or its folder")

@@ -30,4 +30,10 @@ def gsstream_commands() -> list[CommandSpec]:
             summary="Write what live cameras see as a folder that 'gsstream run --source watch:' follows.",
             group=GROUP,
         ),
+        CommandSpec(
+            name="calibrate",
+            target="gsstream_capture.commands.calibrate:app",
+            summary="Find lenses and poses of a rig with a printed board, or of what it sees.",
+            group=GROUP,
+        ),
     ]

@@ -10,12 +10,14 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import numpy as np
+
 from gsstream.core.errors import InputError, SourceError, suggest
 from gsstream.input.recordings.calibration import CALIBRATION_FILE, Calibration, read_calibration
 from gsstream_capture.clock import here
 from gsstream_capture.folder import FULL, LOW, FolderWriter
 from gsstream_capture.pairing import Instant, Pairing, Stamped
-from gsstream_capture.pictures import CameraPlan, jpeg, pixels_of, planned
+from gsstream_capture.pictures import CameraPlan, jpeg, pixels_of, planned, upright_size
 from gsstream_capture.reader import CameraReader
 from gsstream_capture.rig import Rig, opening_of, shown
 
@@ -24,6 +26,7 @@ BEGIN, TIMEOUT = 90.0, 30.0
 #: Seconds between two looks while nothing comes.
 LOOK = 0.1
 Say = Callable[[str], None]
+Look = Callable[[int, Any], None]
 
 
 @dataclass
@@ -132,11 +135,15 @@ def calibration_of(rig: Rig) -> tuple[Calibration, Path]:
     return calibration, path
 
 
-def plans_of(live: LiveRig, calibration: Calibration, path: Path) -> list[CameraPlan]:
-    """Return what is done to the pictures of cameras of which all have sent one."""
+def plans_of(live: LiveRig, calibration: Calibration | None, path: Path) -> list[CameraPlan]:
+    """Return what is done to the pictures of cameras of which all have sent one; without a calibration, turning."""
     sizes = [reader.health.size for reader in live.readers]
     assert all(sizes), "the first instant has pictures of all"
     specs = live.rig.cameras
+    if calibration is None:
+        upright = [upright_size(size or (0, 0), spec.rotate) for size, spec in zip(sizes, specs, strict=True)]
+        known = np.eye(3), np.eye(4)
+        return [CameraPlan(c.id, *known, size, "train", c.rotate) for c, size in zip(specs, upright, strict=True)]
     return planned(
         [spec.id for spec in specs],
         [spec.rotate for spec in specs],
@@ -147,31 +154,41 @@ def plans_of(live: LiveRig, calibration: Calibration, path: Path) -> list[Camera
 
 
 def run_capture(
-    rig: Rig, folder: Path, out: Path, *, seconds: float | None, say: Say, stopped: threading.Event
+    rig: Rig,
+    folder: Path,
+    out: Path,
+    *,
+    seconds: float | None,
+    say: Say,
+    stopped: threading.Event,
+    raw: bool = False,
+    look: Look | None = None,
 ) -> Report:
     """Capture until ``seconds`` have passed, ``stopped`` is set, or all cameras are silent; END is written then.
 
     Arguments:
         folder: that paths in the rig file are relative to.
         say: takes one line when a camera goes or comes back.
+        raw: write pictures as they come, turned but not straightened, without a calibration.
+        look: is shown every picture that is written: the camera's number, and its pixels, blue first.
 
     Raises:
         SourceError: no calibration, or a camera sends nothing from the start; the message names it and why.
         OutputError: the folder holds something, or cannot be written.
     """
-    calibration, path = calibration_of(rig)
+    calibration, path = (None, out) if raw else calibration_of(rig)
     if out.exists() and any(out.iterdir()):
         raise InputError(f"{out} is not empty; expected a new folder, choose another --out")
     with LiveRig(rig, folder) as live:
         say(f"waiting for {len(rig.cameras)} cameras")
         instant: Instant | None = live.first()
         plans = plans_of(live, calibration, path)
-        more = {"name": calibration.name, "licence": calibration.licence}
-        writer = FolderWriter(out, plans, rig.fps, more={key: value for key, value in more.items() if value})
+        more = None if calibration is None else {"name": calibration.name, "licence": calibration.licence}
+        writer = FolderWriter(out, plans, rig.fps, more=more)
         say("; ".join(f"{r.spec.id}: {_described(r)}" for r in live.readers))
         report = Report(absent=dict.fromkeys((spec.id for spec in rig.cameras), 0))
         try:
-            _loop(live, writer, plans, report, _Until(seconds, stopped), say=say, instant=instant)
+            _loop(live, writer, plans, report, _Until(seconds, stopped, look), say=say, instant=instant)
         finally:
             writer.end()
             report.frames, report.dropped = writer.frames, live.pairing.counts.dropped
@@ -196,6 +213,7 @@ CLOCKS = {
 class _Until:
     seconds: float | None
     stopped: threading.Event
+    look: Look | None = None
     began: float = field(default_factory=time.monotonic)
 
     def over(self) -> bool:
@@ -215,7 +233,7 @@ def _loop(
     """Write instants until it is over; ``instant``: the first, which is there."""
     states = {reader.number: reader.health.state for reader in live.readers}
     while True:
-        if instant is not None and not _write(live, writer, plans, report, instant):
+        if instant is not None and not _write(live, writer, plans, report, instant=instant, look=until.look):
             report.ended = "the disk is full"
         _tell_changes(live, states, say)
         if all(reader.health.state == "ended" for reader in live.readers) and instant is None:
@@ -227,7 +245,15 @@ def _loop(
         instant = live.next(LOOK)
 
 
-def _write(live: LiveRig, writer: FolderWriter, plans: list[CameraPlan], report: Report, instant: Instant) -> bool:
+def _write(
+    live: LiveRig,
+    writer: FolderWriter,
+    plans: list[CameraPlan],
+    report: Report,
+    *,
+    instant: Instant,
+    look: Look | None,
+) -> bool:
     """Write one instant, or count it where the disk is nearly full; False: there is no room for anything."""
     free = writer.free if writer.frames % 10 == 0 or report.disk else LOW
     if free < LOW:
@@ -235,8 +261,10 @@ def _write(live: LiveRig, writer: FolderWriter, plans: list[CameraPlan], report:
         return free >= FULL
     files = {}
     for number, picture in instant.pictures.items():
-        plan = plans[number]
-        files[number] = jpeg(plan.apply(pixels_of(picture.frame, plan.rotate)), live.rig.quality)
+        pixels = plans[number].apply(pixels_of(picture.frame, plans[number].rotate))
+        files[number] = jpeg(pixels, live.rig.quality)
+        if look is not None:
+            look(number, pixels)
     writer.add(files, _line(live, instant))
     report.whole += not instant.absent
     for number in instant.absent:

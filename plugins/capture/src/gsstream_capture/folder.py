@@ -18,13 +18,21 @@ LOG, END = "capture.jsonl", "END"
 
 
 class FolderWriter:
-    """Writes instants; a picture is there whole or not at all. Raises OutputError for a folder that holds something."""
+    """Writes instants; a picture is there whole or not at all. Raises OutputError for a folder that holds something.
 
-    def __init__(self, out: Path, plans: Sequence[CameraPlan], fps: float, *, more: Mapping[str, Any]) -> None:
+    ``more``: what cameras.json says besides; None: pictures as they came, without a cameras.json.
+    """
+
+    def __init__(self, out: Path, plans: Sequence[CameraPlan], fps: float, *, more: Mapping[str, Any] | None) -> None:
         self._out, self._plans, self.frames = out, plans, 0
         claim(out)
         for plan in plans:
             (out / plan.name).mkdir()
+        if more is not None:
+            self._describe({"schema": SCHEMA, "fps": fps, **more})
+        self._log = (out / LOG).open("a", encoding="utf-8")
+
+    def _describe(self, data: dict[str, Any]) -> None:
         cameras = [
             {
                 "id": plan.name,
@@ -35,11 +43,9 @@ class FolderWriter:
                 "frames": f"{plan.name}/%06d.jpg",
                 "split": plan.split,
             }
-            for plan in plans
+            for plan in self._plans
         ]
-        text = json.dumps({"schema": SCHEMA, "fps": fps, **more, "cameras": cameras}, indent=1)
-        self._put(out / CALIBRATION_FILE, text.encode())
-        self._log = (out / LOG).open("a", encoding="utf-8")
+        self._put(self._out / CALIBRATION_FILE, json.dumps({**data, "cameras": cameras}, indent=1).encode())
 
     @property
     def free(self) -> int:

@@ -27,7 +27,7 @@ ROOT = Path(__file__).parent
 #: while the others wait. A name that is missing here costs only time.
 LONG = (
     "flow/test_closed_loop", "flow/test_kills", "flow/test_repeat_and_resume", "flow/test_resume",
-    "flow/test_key_refresh", "lab/tests/test_sweep_real",
+    "flow/test_key_refresh", "lab/tests/test_sweep_real", "capture/tests/test_faults",
     "cpu_render/tests/test_cross_aarch64", "contract/test_new_plugin", "contract/test_howtos",
     "discovery/test_six_rings", "lab/tests/test_paper_configs", "web/test_page", "flow/test_budget",
     "contract/test_saboteurs", "contract/test_shipped_plugins", "flow/test_no_overshoot", "web/test_live_page",

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from gsstream_capture.folder import FULL, LOW, FolderWriter
 from gsstream_capture.pairing import Instant, Pairing, Stamped
 from gsstream_capture.pictures import CameraPlan, jpeg, pixels_of, planned, upright_size
 from gsstream_capture.reader import CameraReader
+from gsstream_capture.report import Report
 from gsstream_capture.rig import Rig, opening_of, shown
 
 #: Seconds that the first whole instant may take, and without any picture after which a capture has ended.
@@ -27,19 +27,6 @@ BEGIN, TIMEOUT = 90.0, 30.0
 LOOK = 0.1
 Say = Callable[[str], None]
 Look = Callable[[int, Any], None]
-
-
-@dataclass
-class Report:
-    """What a capture did."""
-
-    frames: int = 0
-    whole: int = 0
-    dropped: int = 0  # instants, because too many waited
-    disk: int = 0  # instants, because the disk was full
-    ended: str = ""  # why, where nobody asked for it
-    absent: dict[str, int] = field(default_factory=dict)
-    delays: list[float] = field(default_factory=list)  # seconds from an instant to its files, the last 10,000
 
 
 class LiveRig:
@@ -300,16 +287,3 @@ def _tell_changes(live: LiveRig, states: dict[int, Any], say: Say) -> None:
         else:
             say(f"{name} is {'refused' if gone == 'refused' else 'gone'}: {reader.health.why or 'its file has ended'}")
         states[reader.number] = gone
-
-
-def summary(report: Report) -> str:
-    """Return what a capture did, in lines."""
-    lines = [f"{report.frames} instants, {report.whole} of them of all cameras"]
-    if report.delays:
-        lines[0] += f"; from the instant to its files {1000 * median(report.delays):.0f} ms (median)"
-    lines += [f"{name}: absent in {count}" for name, count in report.absent.items() if count]
-    if report.dropped:
-        lines.append(f"{report.dropped} instants dropped: this machine was too busy; lower fps or the resolution")
-    if report.disk:
-        lines.append(f"{report.disk} instants dropped: less than 1 GB of the disk is free")
-    return "\n".join(lines)

@@ -13,7 +13,8 @@ import typer
 if TYPE_CHECKING:
     from gsstream_capture.board.hint import Hint
 
-#: Seconds between two hints.
+#: Seconds that a check looks, and between two hints.
+CHECK = 10.0
 HINT_EVERY = 4.0
 
 
@@ -24,6 +25,9 @@ def capture(
     raw: Annotated[
         bool, typer.Option("--raw", help="Pictures as they come, without a calibration: takes of a board.")
     ] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Look at all cameras for ten seconds, and say what is found.")
+    ] = False,
 ) -> None:
     """Write what live cameras see as a folder that 'gsstream run --source watch:' follows.
 
@@ -31,10 +35,17 @@ def capture(
     says which part of each camera's picture the board has not been in.
     """
     from gsstream.core.errors import InputError
-    from gsstream_capture.capture import run_capture, summary
+    from gsstream_capture.capture import run_capture
+    from gsstream_capture.report import summary
     from gsstream_capture.rig import read_rig
 
     found = read_rig(rig)
+    if check:
+        from gsstream_capture.check import check as look_at
+
+        where = out or rig.with_name(f"{rig.stem}-check-{time.strftime('%Y%m%d-%H%M%S')}")
+        look_at(found, rig.parent, where, seconds=seconds or CHECK, say=_say)
+        return
     if out is None:
         raise InputError("expected --out DIR, a new folder for the pictures")
     stopped = threading.Event()

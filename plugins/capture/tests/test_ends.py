@@ -1,0 +1,53 @@
+"""How a capture ends that nobody ended: a full disk, and cameras that are all silent."""
+
+from __future__ import annotations
+
+import threading
+import time
+from types import SimpleNamespace
+
+import pytest
+from gsstream_capture import capture, folder
+from gsstream_capture.report import summary
+from gsstream_capture.rig import read_rig
+from live_rig import NEEDS, Server, calibration, captured, encoded, grey, has_server, painted, rig_file
+
+SIZE = (160, 120)
+
+
+def numbered(count):
+    return (painted(grey(i, SIZE), i) for i in range(count))
+
+
+@pytest.mark.parametrize(("free", "frames"), [(500_000_000, 10), (50_000_000, 10), (5_000_000_000, 60)])
+def test_a_disk_that_fills_up(tmp_path, monkeypatch: pytest.MonkeyPatch, free, frames) -> None:
+    """Whole instants are dropped and counted; where nothing is left the capture ends, and is a whole recording."""
+    calibration(tmp_path, ["a"], SIZE)
+    encoded(tmp_path / "a", numbered(60), 15, suffix="mp4")
+    rig = read_rig(rig_file(tmp_path, {"a": "a.mp4"}, 15))
+    # The system says that there is room, until ten instants are there.
+    left = iter([5_000_000_000])
+    monkeypatch.setattr(folder.shutil, "disk_usage", lambda _: SimpleNamespace(free=next(left, free)))
+    out = tmp_path / "out"
+    report = capture.run_capture(rig, tmp_path, out, seconds=None, say=lambda _: None, stopped=threading.Event())
+    assert abs(report.frames - frames) <= 2
+    assert len(captured(out)) == report.frames
+    assert (out / "END").exists()
+    assert (report.ended == "the disk is full") == (free < folder.FULL)
+    assert (report.disk > 0) == (free < folder.LOW)
+    assert ("less than 1 GB" in summary(report)) == (free < folder.LOW)
+
+
+@pytest.mark.skipif(not has_server(), reason=f"no RTSP server of GStreamer here (apt install {NEEDS})")
+def test_all_cameras_are_silent(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calibration(tmp_path, ["a"], SIZE)
+    units = encoded(tmp_path / "a", numbered(100), 10)
+    monkeypatch.setattr(capture, "TIMEOUT", 2.0)
+    with Server({"a": units}, 10, time.time()) as server:
+        rig = read_rig(rig_file(tmp_path, {"a": server.url("a")}, 10, more="clock: arrival\n"))
+        threading.Timer(7.0, server.stop).start()
+        out, none = tmp_path / "out", threading.Event()
+        report = capture.run_capture(rig, tmp_path, out, seconds=60, say=lambda _: None, stopped=none)
+    assert report.ended == "no camera has sent a picture for 2 s"
+    assert (out / "END").exists()
+    assert report.frames > 5

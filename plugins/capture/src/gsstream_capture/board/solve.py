@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -137,23 +138,32 @@ def _placed(solution: Solution, takes: Takes) -> Solution:
 
 def write(found: Calibrated, path: Path, fps: float) -> None:
     """Write ``cameras.json``, in metres."""
-    cameras = []
-    for name, size, lens, pose in zip(
-        found.names, found.sizes, found.solution.lenses, found.solution.cameras, strict=True
-    ):
-        fx, fy, cx, cy, *bent = (float(value) for value in lens)
-        cameras.append(
-            {
-                "id": name,
-                "width": size[0],
-                "height": size[1],
-                "K": [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
-                "distortion": bent,
-                "w2c": matrix(pose).tolist(),
-                "frames": f"{name}/%06d.jpg",
-            }
+    rows = [
+        camera_row(name, size, lens=lens, w2c=matrix(pose))
+        for name, size, lens, pose in zip(
+            found.names, found.sizes, found.solution.lenses, found.solution.cameras, strict=True
         )
-    data = {"schema": SCHEMA, "fps": fps, "units": "metres", "cameras": cameras}
+    ]
+    write_cameras(path, rows, fps=fps, units="metres")
+
+
+def camera_row(name: str, size: tuple[int, int], *, lens: FloatArray, w2c: FloatArray) -> dict[str, Any]:
+    """Return a camera of ``cameras.json`` for pictures as they come; ``lens`` [9] as the adjustment has it."""
+    fx, fy, cx, cy, *bent = (float(value) for value in lens)
+    return {
+        "id": name,
+        "width": size[0],
+        "height": size[1],
+        "K": [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
+        "distortion": bent,
+        "w2c": w2c.tolist(),
+        "frames": f"{name}/%06d.jpg",
+    }
+
+
+def write_cameras(path: Path, rows: Sequence[dict[str, Any]], *, fps: float, units: str) -> None:
+    """Write ``cameras.json``."""
+    data = {"schema": SCHEMA, "fps": fps, "units": units, "cameras": rows}
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 

@@ -47,13 +47,10 @@ def board(
     Refuses lenses that are not sure to one percent, and cameras that saw the board together with others too rarely.
     """
     from gsstream.cli.working import working
-    from gsstream.core.errors import InputError
-    from gsstream.input.recordings.calibration import CALIBRATION_FILE
     from gsstream_capture.board.solve import report, solve, write
     from gsstream_capture.board.takes import read_takes
 
-    if out.name != CALIBRATION_FILE:
-        raise InputError(f"--out {out}: expected a file of the name {CALIBRATION_FILE}")
+    _named(out)
     with working("looking for the board", quiet) as display:
         found = read_takes(takes, display.tell)
         display.tell("adjusting")
@@ -63,3 +60,31 @@ def board(
     out.with_name("calibration.txt").write_text(text + "\n", encoding="utf-8")
     typer.echo(text)
     typer.echo(f"wrote {out}")
+
+
+@app.command("scene")
+def scene(
+    raw: Annotated[
+        Path, typer.Argument(metavar="RAW", help="Folder of 'gsstream capture --raw'.")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="The cameras.json to write.")],
+    each: Annotated[bool, typer.Option("--each", help="Every camera has a lens of its own.")] = False,
+    fps: Annotated[float, typer.Option("--fps", min=0.1, max=1000, help="Rate of the recordings to come.")] = 10.0,
+) -> None:
+    """Find lenses and poses by what the cameras see of one instant, without a board and without metres.
+
+    It takes views that overlap and show texture; lenses are less sure than with a board.
+    """
+    from gsstream_capture.scene import calibrate_scene
+
+    _named(out)
+    calibrate_scene(raw, out, each=each, fps=fps, say=typer.echo)
+    typer.echo(f"wrote {out}")
+
+
+def _named(out: Path) -> None:
+    from gsstream.core.errors import InputError
+    from gsstream.input.recordings.calibration import CALIBRATION_FILE
+
+    if out.name != CALIBRATION_FILE:
+        raise InputError(f"--out {out}: expected a file of the name {CALIBRATION_FILE}")

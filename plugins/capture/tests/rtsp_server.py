@@ -49,7 +49,7 @@ class Factory(GstRtspServer.RTSPMediaFactory):
 
     def do_create_element(self, url):
         return Gst.parse_launch(
-            "( appsrc name=src is-live=true do-timestamp=true format=time "
+            "( appsrc name=src is-live=true format=time "
             f"caps=video/x-h264,stream-format=byte-stream,alignment=au,framerate={int(self.fps)}/1 ! "
             "h264parse ! rtph264pay name=pay0 pt=96 config-interval=1 )"
         )
@@ -81,7 +81,13 @@ def push(state, epoch, fps):
             state.garbage -= 1
             noise = bytes(draw.randrange(1, 256) for _ in range(len(unit) - 5))
             unit = unit[:5] + noise
-        source.emit("push-buffer", Gst.Buffer.new_wrapped(unit))
+        # Stamped with the time at which it was to be sent: a camera knows when it exposed, however busy it is.
+        clock, base = source.get_clock(), source.get_base_time()
+        if clock is None:
+            continue
+        buffer = Gst.Buffer.new_wrapped(unit)
+        buffer.pts = max(0, clock.get_time() - base - int(1e9 * (time.time() - at)))
+        source.emit("push-buffer", buffer)
 
 
 def obey(states, loop):

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 from board_views import places_of, rendered, takes
 from gsstream_capture.board.design import Board, Finder, Sighting, page, read_board
-from gsstream_capture.board.solve import report, solve
+from gsstream_capture.board.solve import report, solve, solved, write
 from gsstream_capture.board.start import matrix
 from gsstream_capture.board.takes import Takes, read_takes
 from test_board_adjust import circle, errors, rotations
@@ -99,11 +101,13 @@ def test_a_rig_is_found(taken, tmp_path, capsys) -> None:
     assert all(float(row[6]) < 0.6 for row in rows), "held out, pixels"
 
 
-def test_angles_and_the_report(taken) -> None:
-    folder, truth = taken
-    found = solve(read_takes(folder, lambda *_: None))
-    from types import SimpleNamespace
+@pytest.fixture(scope="module")
+def read(taken):
+    return read_takes(taken[0], lambda *_: None)
 
+
+def test_angles_and_the_report(taken, read) -> None:
+    truth, found = taken[1], solve(read)
     angle, place, focal = errors(found.solution, SimpleNamespace(**{k: truth[k] for k in ("cameras", "lenses")}))
     assert angle < 0.25
     assert place < 0.005
@@ -112,21 +116,16 @@ def test_angles_and_the_report(taken) -> None:
     assert "pictures shared" in report(found)
 
 
-def test_without_a_lens_take_it_says_what_is_loose(taken, tmp_path) -> None:
-    folder, _ = taken
-    (tmp_path / "board.yaml").write_text((folder / "board.yaml").read_text())
-    (tmp_path / "rig").symlink_to(folder / "rig")
-    from gsstream_capture.board.solve import solved
-
-    found = solved(read_takes(tmp_path, lambda *_: None))
+def test_without_a_lens_take_it_says_what_is_loose(read) -> None:
+    rig = {key: one for key, one in read.seen.items() if key[1] < read.rig_pictures}
+    found = solved(replace(read, seen=rig, pictures=read.rig_pictures, lens_pictures=(0, 0, 0)))
     assert found.loose == ("a", "b", "c")
     assert "WARNING: no lens take of a, b, c" in report(found)
 
 
-def test_lenses_that_are_known_stay(taken, tmp_path) -> None:
-    folder, _ = taken
-    first = tmp_path / "first" / "cameras.json"
-    assert run_command(["calibrate", "board", str(folder), "--out", str(first), "--quiet"]) == 0
+def test_lenses_that_are_known_stay(taken, read, tmp_path) -> None:
+    folder, first = taken[0], tmp_path / "first" / "cameras.json"
+    write(solve(read), first, 10.0)
     (tmp_path / "lens").mkdir()
     (tmp_path / "lens" / "cameras.json").write_text(first.read_text())
     (tmp_path / "board.yaml").write_text((folder / "board.yaml").read_text())

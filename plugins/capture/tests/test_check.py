@@ -68,7 +68,7 @@ def films(folder: Path, demo, late: int) -> Path:
 
 def test_what_agrees_is_said_to_agree(demo, tmp_path) -> None:
     rig, said = films(tmp_path, demo, 0), []
-    check(read_rig(rig), tmp_path, tmp_path / "out", seconds=2.0, say=said.append)
+    check(read_rig(rig), tmp_path, tmp_path / "out", seconds=1.2, say=said.append)
     told = said[-1]
     names = [plan.name for plan in demo[0]]
     assert all(f"{name}: 160 x 120, 10.0/s, paired by its own clock, " in told for name in names)
@@ -83,5 +83,5 @@ def test_pictures_that_contradict_the_clocks_are_refused(demo, tmp_path) -> None
     rig, said = films(tmp_path, demo, 3), []
     name = demo[0][2].name
     with pytest.raises(SourceError, match=rf"contradict the clocks: camera '{name}' is 3 frames late"):
-        check(read_rig(rig), tmp_path, tmp_path / "out", seconds=3.0, say=said.append)
+        check(read_rig(rig), tmp_path, tmp_path / "out", seconds=2.5, say=said.append)
     assert f"{name}: 160 x 120" in said[-1], "the table is said all the same"

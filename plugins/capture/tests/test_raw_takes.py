@@ -22,10 +22,10 @@ def test_raw_pictures_are_takes(tmp_path, capsys) -> None:
     pictures = [
         rendered(BOARD, LENS, facing(draw, [0.05, 0, 0.9]), SIZE, draw)[..., None].repeat(3, 2) for _ in range(6)
     ]
-    encoded(tmp_path / "a", (pictures[i % 6] for i in range(30)), 10, suffix="mp4")
-    encoded(tmp_path / "b", (np.rot90(pictures[i % 6]) for i in range(30)), 10, suffix="mp4")
+    encoded(tmp_path / "a", (pictures[i % 6] for i in range(34)), 15, suffix="mp4")
+    encoded(tmp_path / "b", (np.rot90(pictures[i % 6]) for i in range(34)), 15, suffix="mp4")
     rig = tmp_path / "rig.yaml"
-    rig.write_text("cameras:\n- {id: a, url: a.mp4}\n- {id: b, url: b.mp4, rotate: 90}\n")
+    rig.write_text("fps: 15\ncameras:\n- {id: a, url: a.mp4}\n- {id: b, url: b.mp4, rotate: 90}\n")
     folder = tmp_path / "takes"
     folder.mkdir()
     (folder / "board.yaml").write_text("columns: 5\nrows: 4\nsquare_mm: 80\n")

@@ -189,4 +189,4 @@ def _decoded(packet: Any) -> tuple[list[Any], bool]:
     except av.error.InvalidDataError:
         return [], True
     sound = [frame for frame in frames if not frame.is_corrupt]
-    return sound, len(sound) < len(frames)
+    return sound, len(sound) < len(frames) or packet.is_corrupt

@@ -64,9 +64,7 @@ def board(
 
 @app.command("scene")
 def scene(
-    raw: Annotated[
-        Path, typer.Argument(metavar="RAW", help="Folder of 'gsstream capture --raw'.")
-    ],
+    raw: Annotated[Path, typer.Argument(metavar="RAW", help="Folder of 'gsstream capture --raw'.")],
     out: Annotated[Path, typer.Option("--out", help="The cameras.json to write.")],
     each: Annotated[bool, typer.Option("--each", help="Every camera has a lens of its own.")] = False,
     fps: Annotated[float, typer.Option("--fps", min=0.1, max=1000, help="Rate of the recordings to come.")] = 10.0,

@@ -1,0 +1,143 @@
+"""A rehearsal of live cameras: a recording as RTSP cameras on loopback, captured, and told what came of it.
+
+Usage: python -m tools.rehearsal --source DIR --fps 10 --seconds 60 --late 30 --out OUT
+
+Pictures are encoded ahead as H.264 with their number painted in, and sent by one process of GStreamer's server for each
+camera (apt install gir1.2-gst-rtsp-server-1.0 python3-gst-1.0 gstreamer1.0-plugins-good gstreamer1.0-plugins-bad), with
+a few milliseconds of jitter. The second camera is ``--late`` milliseconds late, and with ``--unplug SECONDS`` the third
+one is killed after a third of the time and comes back so much later.
+
+Writes OUT/capture and OUT/rehearsal.json: instants that are whole and of one number, offsets, delays, memory of the
+process that captures, and the load of the machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from gsstream.core.errors import InputError
+from gsstream.encode import open_recording
+from gsstream.input.recordings.calibration import CALIBRATION_FILE
+from gsstream.input.recordings.open import DEMO_FOLDER
+from tools.drill import there_and_back
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "plugins" / "capture" / "tests"))
+#: Pictures of a camera, which then begin again; milliseconds of jitter.
+LENGTH, JITTER = 400, 8
+
+
+def rehearse(finished: Path, out: Path, given: argparse.Namespace) -> dict[str, Any]:
+    """Serve a recording, capture it, and return what is reported. Raises InputError where ``out`` is not new."""
+    from live_rig import Capturing, Server, encoded, painted, rig_file
+
+    if out.exists():
+        raise InputError(f"{out} exists; expected a new folder, choose another --out")
+    out.mkdir(parents=True)
+    shutil.copyfile(finished / CALIBRATION_FILE, out / CALIBRATION_FILE)
+    with open_recording(str(finished)) as source:
+        names = list(source.info.train.ids[: given.cameras])
+
+        def pictures(name: str) -> Iterator[Any]:
+            length = source.info.num_frames or 1
+            for index in range(LENGTH):
+                image = source.image(there_and_back(index, length), name)
+                yield painted(np.round(255 * image).astype(np.uint8), index)
+
+        units = {name: encoded(out / name, pictures(name), round(given.fps)) for name in names}
+    epoch = time.time()
+    servers = {name: Server({name: units[name]}, given.fps, epoch) for name in names}
+    for name, server in servers.items():
+        server.say(f"jitter {name} {JITTER}")
+    servers[names[1]].say(f"delay {names[1]} {given.late}")
+    rig = rig_file(out, {name: server.url(name) for name, server in servers.items()}, given.fps)
+    memory: list[int] = []
+    try:
+        capture = Capturing(rig, out / "capture", "--seconds", str(given.seconds))
+        capture.wait_for("paired by", 90)
+        if given.unplug:
+            lost = (servers, names[2], units[names[2]], epoch)
+            threading.Thread(target=_unplug, args=(*lost, given), daemon=True).start()
+        while capture.process.poll() is None:
+            memory.append(_resident(capture.process.pid))
+            time.sleep(1.0)
+        code = capture.end()
+    finally:
+        for server in servers.values():
+            server.stop()
+    numbers = reported(out / "capture", names)
+    return {"code": code, "said": capture.lines, **numbers, "memory_mb": memory[:: 1 + len(memory) // 20]}
+
+
+def _unplug(servers: dict[str, Any], name: str, units: Path, epoch: float, given: argparse.Namespace) -> None:
+    from live_rig import Server
+
+    time.sleep(given.seconds / 3)
+    port = servers[name].port
+    servers[name].stop()
+    time.sleep(given.unplug)
+    servers[name] = Server({name: units}, given.fps, epoch, port=port)
+
+
+def reported(folder: Path, names: Sequence[str]) -> dict[str, Any]:
+    """Return the numbers of a capture whose pictures carry their number."""
+    from live_rig import captured
+
+    numbers = captured(folder)
+    lines = [json.loads(line) for line in (folder / "capture.jsonl").read_text(encoding="utf-8").splitlines()]
+    one = [len(set(row.values())) == 1 for row in numbers]
+    offsets = {name: [line["offset_ms"][name] for line in lines if name in line["offset_ms"]] for name in names}
+    return {
+        "instants": len(numbers),
+        "whole_and_right": sum(right and len(row) == len(names) for right, row in zip(one, numbers, strict=True)),
+        "mixed": len(one) - sum(one),
+        "absent": {name: sum(name not in row for row in numbers) for name in names},
+        "offset_ms": {name: median(values) for name, values in offsets.items() if values},
+        "to_file_ms": median(line["written_ms"] for line in lines),
+        "load": os.getloadavg()[0],
+    }
+
+
+def _resident(process: int) -> int:
+    try:
+        text = Path(f"/proc/{process}/status").read_text(encoding="ascii")
+    except OSError:
+        return 0
+    found = [line.split()[1] for line in text.splitlines() if line.startswith("VmRSS")]
+    return int(found[0]) // 1024 if found else 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run as a command; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--source", default="demo", help="demo, or a folder with cameras.json")
+    parser.add_argument("--cameras", type=int, default=4)
+    parser.add_argument("--fps", type=float, default=10.0)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--late", type=float, default=30.0, help="milliseconds that the second camera is late")
+    parser.add_argument("--unplug", type=float, default=0.0, help="seconds that the third camera is gone")
+    parser.add_argument("--out", type=Path, required=True)
+    given = parser.parse_args(arguments)
+    if not 3 <= given.cameras <= 64 or given.fps <= 0 or given.seconds <= 0:
+        raise InputError("expected 3 to 64 cameras, and --fps and --seconds above 0")
+    finished = DEMO_FOLDER if given.source == "demo" else Path(given.source)
+    text = json.dumps(rehearse(finished, given.out, given), indent=1)
+    (given.out / "rehearsal.json").write_text(text + "\n", encoding="utf-8")
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -66,9 +66,11 @@ def encoded(path: Path, pictures, fps: int, *, gop: int = 10, suffix: str = "uni
         stream.time_base = Fraction(1, fps)
         if codec == "libx264":
             stream.options = {
-                "preset": "ultrafast", "tune": "zerolatency", "crf": "20",
+                "preset": "ultrafast",
+                "tune": "zerolatency",
+                "crf": "20",
                 "x264-params": f"keyint={gop}:scenecut=0:bframes=0:repeat-headers=1",
-            }  # fmt: skip
+            }
         units = []
         for picture in (first, *pictures):
             packets = stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24"))

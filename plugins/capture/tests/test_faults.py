@@ -27,7 +27,7 @@ from live_rig import (
     number_of,
     painted,
     rig_file,
-)  # fmt: skip
+)
 from PIL import Image
 
 FPS, SIZE, LENGTH = 10, (320, 240), 500

@@ -51,8 +51,10 @@ few = settings(max_examples=15)
 @few
 @given(
     st.lists(st.tuples(st.floats(-0.015, 0.015), st.floats(0, 1.4)), min_size=1, max_size=6),
-    st.floats(0, 0.3), st.integers(0, 2**20), st.floats(0, 10),
-)  # fmt: skip
+    st.floats(0, 0.3),
+    st.integers(0, 2**20),
+    st.floats(0, 10),
+)
 def test_every_instant_is_whole_and_of_one_number_whatever_the_delays(cameras, shake, seed, start) -> None:
     rows = rig(*zip(*cameras, strict=True), 80, start=1e9 + start, jitter=0.008, shake=shake, seed=seed)
     pairing, out = played(rows, len(cameras))

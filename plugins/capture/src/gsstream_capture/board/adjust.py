@@ -97,13 +97,37 @@ def project(lens: FloatArray, at: FloatArray) -> tuple[FloatArray, FloatArray, F
     one, zero = np.ones_like(x), np.zeros_like(x)
     by_lens = np.stack(
         [
-            np.stack([bent_x, zero, one, zero, fx * x * square, fx * x * square**2, fx * 2 * x * y,
-                      fx * (square + 2 * x * x), fx * x * square**3], -1),
-            np.stack([zero, bent_y, zero, one, fy * y * square, fy * y * square**2, fy * (square + 2 * y * y),
-                      fy * 2 * x * y, fy * y * square**3], -1),
+            np.stack(
+                [
+                    bent_x,
+                    zero,
+                    one,
+                    zero,
+                    fx * x * square,
+                    fx * x * square**2,
+                    fx * 2 * x * y,
+                    fx * (square + 2 * x * x),
+                    fx * x * square**3,
+                ],
+                -1,
+            ),
+            np.stack(
+                [
+                    zero,
+                    bent_y,
+                    zero,
+                    one,
+                    fy * y * square,
+                    fy * y * square**2,
+                    fy * (square + 2 * y * y),
+                    fy * 2 * x * y,
+                    fy * y * square**3,
+                ],
+                -1,
+            ),
         ],
         -2,
-    )  # fmt: skip
+    )
     cross = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
     bent_by = np.stack(
         [

@@ -32,8 +32,8 @@ class SyntheticOptions(BaseModel):
     scene: SceneName = Field(
         default="paths",
         description="what happens. paths: two objects on smooth paths; at frame 'event' they stop (stop) or turn back "
-        "(reversal), or the light flashes for that frame (flash); a ball bounces off the floor (bounce) or goes "
-        "through a tunnel (occlusion)",
+        "(reversal), or the light flashes for that frame (flash), is brighter from it on (lamp) or falls slowly from "
+        "it on (dim); a ball bounces off the floor (bounce) or goes through a tunnel (occlusion)",
     )
     event: int = Field(default=8, ge=1, le=100_000, description="the frame at which the scene's event happens")
     frames: int = Field(default=40, ge=1, description="number of frames")

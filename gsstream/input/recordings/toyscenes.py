@@ -1,4 +1,4 @@
-"""Events for the synthetic scene: bodies stop, turn back, bounce or hide, or the light flashes, at a known frame.
+"""Events for the synthetic scene: bodies stop, turn back, bounce or hide, or the light changes, at a known frame.
 
 The frame is the option ``event`` (E below). Everything is analytic, so that places, depths and masks are exact.
 """
@@ -15,13 +15,17 @@ from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.primitives import Box, Placed, Sphere, Surface
 from gsstream.input.recordings.toyroom import moving_shapes, static_shapes
 
-SceneName = Literal["paths", "stop", "reversal", "bounce", "occlusion", "flash"]
+SceneName = Literal["paths", "stop", "reversal", "bounce", "occlusion", "flash", "lamp", "dim"]
 #: Path of a body from one frame to the next with the option motion = 1, metres: about 5 pixels at a width of 160.
 STEP = 0.08
 #: Light of the frame of a flash, times that of the others.
 FLASH = 1.6
+#: Light from the frame on in which a lamp is switched on, times that before.
+LAMP = 1.3
+#: What is lost of the light in every frame in which it dims, and what is left of it in the end.
+DIM, DARKEST = 0.0025, 0.6
 #: Scenes whose objects go the way of "paths", with another clock or none.
-_ON_PATHS = ("paths", "stop", "reversal", "flash")
+_ON_PATHS = ("paths", "stop", "reversal", "flash", "lamp", "dim")
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +72,12 @@ class ToyScene:
 
     def light(self, index: int) -> float:
         """Return the factor on all colours at a frame."""
-        return FLASH if self.name == "flash" and index == self.event else 1.0
+        late = index - self.event
+        if self.name == "dim":
+            return max(1 - DIM * max(late, 0), DARKEST)
+        if self.name == "lamp":
+            return LAMP if late >= 0 else 1.0
+        return FLASH if self.name == "flash" and late == 0 else 1.0
 
 
 def _surface(number: int, color: tuple[float, float, float]) -> Surface:

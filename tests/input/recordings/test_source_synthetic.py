@@ -195,6 +195,20 @@ def test_a_flash_lights_one_frame_of_all_cameras_and_moves_nothing() -> None:
         np.testing.assert_allclose(bright, np.minimum(1.6 * dark, 1), atol=1.6 / 255)
 
 
+@pytest.mark.parametrize(("name", "later"), [("lamp", [1.3] * 3), ("dim", [1.0, 0.9975, 0.995])])
+def test_the_light_stays_changed_and_nothing_else_does(name: str, later: list[float]) -> None:
+    changed, paths = scene(name), scene("paths")
+    for index, factor in zip(range(EVENT - 1, EVENT + 3), [1.0, *later], strict=True):
+        for split in ("train", "test"):
+            before, after = paths.frame(index, split).images, changed.frame(index, split).images
+            # Both are rounded to 8 bits; what white was before it was cut off is not known.
+            known = before < 1
+            wanted = np.minimum(before * factor, 1)
+            np.testing.assert_allclose(after[known], wanted[known], atol=1.2 / 255, rtol=0)
+        for body, center in paths.object_positions(index).items():
+            assert np.array_equal(center, changed.object_positions(index)[body])
+
+
 def test_nothing_happens_where_nothing_moves_and_a_wrong_name_is_explained() -> None:
     for name in ("stop", "reversal", "bounce", "occlusion"):
         still = scene(name, static=1)

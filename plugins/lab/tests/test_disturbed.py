@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from gsstream.core.frame import Arrival
 from gsstream.core.rng import Rng
 from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.run.recording import reopen_recording
-from gsstream.input.recordings.base import Source
+from gsstream.input.recordings.base import Source, SourceInfo, Wrapped
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
 from gsstream.input.recordings.options import DataOptions
 from gsstream.input.recordings.transformed import transformed
@@ -114,6 +115,30 @@ def test_clocks_are_shifted_and_no_frame_is_shown_twice(offsets: list[int]) -> N
         source.frame(source.info.num_frames)
 
 
+@pytest.mark.parametrize("offsets", [(), ("cam01@2", "cam02@-1")])
+def test_it_goes_there_and_back_as_often_as_asked_and_shows_each_end_once(offsets: tuple[str, ...]) -> None:
+    once, thrice = disturbed(time_offset=offsets), disturbed(time_offset=offsets, ways=3)
+    there = [once.frame(t).images for t in range(once.info.num_frames or 0)]
+    film = [*there, *there[-2::-1], *there[1:]]
+    assert thrice.info.num_frames == len(film)
+    for index, images in enumerate(film):
+        assert np.array_equal(thrice.frame(index).images, images), index
+        assert thrice.frame(index).index == index
+    with pytest.raises(SourceError, match="has no frame"):
+        thrice.frame(len(film))
+
+
+def test_where_a_film_that_is_still_written_turns_nobody_knows() -> None:
+    class Unended(Wrapped):
+        @property
+        def info(self) -> SourceInfo:
+            return replace(self._source.info, num_frames=None)
+
+    live = Unended(open_source(WORLD))
+    with pytest.raises(SourceError, match=r"ways: .* nobody knows where to turn"):
+        DisturbedSource(live, Disturbances(ways=2), 0, live.info.uri)
+
+
 @given(
     st.sampled_from(["sine", "random"]), st.floats(0.2, 2), st.floats(0, 0.9), st.integers(0, 400), st.integers(0, 9)
 )
@@ -192,6 +217,7 @@ FAULTS = {
     "disturbed:lost_cameras=nobody@1-2:demo": "lost_cameras: no camera 'nobody'",
     "disturbed:lost_cameras=cam03@5-5:demo": "expected ID@A-B with 1 <= A < B",
     "disturbed:lost_cameras=cam03@0-5:demo": "frame 0 needs every training camera",
+    "disturbed:ways=0:demo": "greater than or equal to 1.*there, back",
     "disturbed:time_offset=cam03:demo": "expected ID@FRAMES",
     "disturbed:time_offset=cam03@0.5:demo": "whole frames",
     "disturbed:time_offset=cam9@1:demo": "time_offset: no camera 'cam9'",
@@ -214,7 +240,7 @@ TINY = "synthetic:frames=6&views=3&width=32&height=24&supersample=1"
 @parametrize_with_checks(
     [
         SourceUnderTest(open_disturbed, f"disturbed:{text}:{TINY}")
-        for text in ("gain=0.9,noise_sigma=5", "lost_share=0.5,lost_as=black", "time_offset=cam01@2")
+        for text in ("gain=0.9,noise_sigma=5", "lost_share=0.5,lost_as=black", "time_offset=cam01@2", "ways=3")
     ]
 )
 def test_it_is_a_source_like_any_other(check) -> None:

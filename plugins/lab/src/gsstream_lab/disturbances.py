@@ -45,6 +45,12 @@ class Disturbances(BaseModel):
     lost_as: LostImage = Field(
         default="hold", description="a lost image is: hold: the camera's last one; black: a black one"
     )
+    ways: int = Field(
+        default=1,
+        ge=1,
+        le=10_000,
+        description="times the recording is gone through: there, back, there again ...; each end is shown once",
+    )
     time_offset: tuple[str, ...] = Field(
         default=(), description="ID@FRAMES+...: a camera's frame t + FRAMES stands for frame t, e.g. c3@2+c5@-1"
     )
@@ -104,6 +110,14 @@ def parse_losses(entries: Sequence[str], ids: Sequence[str]) -> dict[str, list[r
             )
         found.setdefault(known_camera("disturbed source: lost_cameras", name, ids, ()), []).append(range(first, last))
     return found
+
+
+def recorded_frame(index: int, frames: int | None) -> int:
+    """Return the frame of a recording of so many frames that a film going there and back shows at ``index``."""
+    if frames is None or frames == 1:
+        return index if frames is None else 0
+    way, place = divmod(index, frames - 1)
+    return frames - 1 - place if way % 2 else place
 
 
 def gain_at(options: Disturbances, index: int, rng: Rng) -> float:

@@ -5,6 +5,7 @@
     gsstream run --source disturbed:noise_sigma=20,seed=1:demo ...
     gsstream run --source disturbed:lost_cameras=cam03@10-20+cam05@3-4,lost_as=black:FOLDER ...
     gsstream run --source disturbed:time_offset=cam03@2:FOLDER ...
+    gsstream run --source disturbed:ways=11:FOLDER ...    # there and back again, five times
 
 A stream names the whole URI as its recording, so that evaluating and resuming see the same disturbed images.
 """
@@ -31,6 +32,7 @@ from gsstream_lab.disturbances import (
     parse_disturbances,
     parse_losses,
     parse_offsets,
+    recorded_frame,
     with_gain,
     with_noise,
 )
@@ -57,8 +59,9 @@ class DisturbedSource(Wrapped):
     """A source over another one under disturbances. Thread-safe when the inner source is; equal seeds give equal bits.
 
     Frame t of the run is frame ``start + t + offset`` of the recording for each camera, where ``start`` makes room for
-    negative offsets; the run is shorter by the span of the offsets, so that no frame of a camera is shown twice.
-    Order: time offset, gain (all cameras), noise, losses and the rounding of storage (training cameras).
+    negative offsets; the run is shorter by the span of the offsets, so that no frame of a camera is shown twice. With
+    several ways t goes there and back. Order: ways, time offset, gain (all cameras), noise, losses and the rounding of
+    storage (training cameras).
     """
 
     def __init__(self, source: Source, disturbances: Disturbances, seed: int, uri: str) -> None:
@@ -77,7 +80,13 @@ class DisturbedSource(Wrapped):
                     f"disturbed source: time_offset: offsets from {min(used)} to {max(used)} leave no common frame of "
                     f"the {info.num_frames} that {info.name!r} has; use smaller offsets"
                 )
-        self._info = replace(info, uri=uri, num_frames=frames)
+        if frames is None and disturbances.ways > 1:
+            raise SourceError(
+                f"disturbed source: ways: {info.name!r} is still being written: nobody knows where to turn"
+            )
+        self._once = frames
+        whole = frames if frames is None else 1 + disturbances.ways * (frames - 1)
+        self._info = replace(info, uri=uri, num_frames=whole)
 
     @property
     def info(self) -> SourceInfo:
@@ -95,7 +104,7 @@ class DisturbedSource(Wrapped):
         shown = self._delivered_frame(camera, index) if training else index
         if shown is None:
             return np.zeros((self._info.train.height, self._info.train.width, 3), np.float32)
-        image = self._source.image(self._start + shown + self._offsets.get(camera, 0), camera)
+        image = self._source.image(self._place(shown) + self._offsets.get(camera, 0), camera)
         image = with_gain(image, gain_at(options, shown, self._rng))
         if training and options.noise_sigma > 0 and shown < options.noise_frames:
             image = with_noise(image, options.noise_sigma, camera, index=shown, rng=self._rng)
@@ -118,7 +127,7 @@ class DisturbedSource(Wrapped):
 
     def moment(self, index: int) -> Moment:
         """Return what the inner source says of an instant, which is there with the last image that it is made of."""
-        moments = {offset: self._source.moment(self._start + index + offset) for offset in self._used_offsets}
+        moments = {offset: self._source.moment(self._place(index) + offset) for offset in self._used_offsets}
         came = [moment.arrival for moment in moments.values() if moment.arrival is not None]
         complete = max((arrival.complete for arrival in came if arrival.complete is not None), default=None)
         missing = {name for arrival in came for name in arrival.absent}
@@ -131,7 +140,11 @@ class DisturbedSource(Wrapped):
 
     def epoch_scale(self, index: int) -> float:
         """Return what the inner source says that a frame is worth."""
-        return self._source.epoch_scale(self._start + index)
+        return self._source.epoch_scale(self._place(index))
+
+    def _place(self, index: int) -> int:
+        """The frame of the recording that a camera without an offset shows."""
+        return self._start + recorded_frame(index, self._once)
 
     @property
     def _used_offsets(self) -> list[int]:

@@ -124,6 +124,13 @@ class Stream(Section):
         le=1,
         description="weight in the loss of the residual's estimated bits per pixel of one view; 0: none",
     )
+    light: float = Field(
+        default=0.0,
+        ge=0,
+        le=100,
+        description="grey levels of 255 by which a third of what stands still must have drifted since its colours last "
+        "followed the light; then all colours that stand still are compared with the images. 0: they never are",
+    )
     refine_frames: int = Field(
         default=0,
         ge=0,

@@ -18,6 +18,8 @@ from gsstream.packet import StreamReader
 
 WORLD = "synthetic:frames=5&views=3&width=32&height=24&supersample=1"
 STILL = f"{WORLD}&static=1"
+DIMMING = "synthetic:scene=dim&event=1&frames=16&views=3&width=48&height=32&supersample=1"
+FOLLOWED = {"stream__light": 0.5}
 SMALL: dict[str, Any] = {
     "stream__epochs": 2,
     "first_frame__max_iterations": 8,
@@ -81,6 +83,12 @@ RUNS: dict[str, Run] = {
     "scaled images, which bytes do not hold": Run(3, flags=("--scale", "0.5")),
     "a budget of bytes": Run(
         3, flags=("--budget", "size=200B"), shows=lambda lines: any(line["budget"]["binding"] for line in lines[1:])
+    ),
+    "colours that follow the light, cut before": Run(
+        9, source=DIMMING, settings=FOLLOWED, shows=lambda lines: "camera_drift" in lines[10]
+    ),
+    "colours that follow the light, cut after": Run(
+        11, source=DIMMING, settings=FOLLOWED, shows=lambda lines: "camera_drift" in lines[10]
     ),
     "growing": Run(4, method="dense", grows=True),
     "growing, with shared gates": Run(4, grows=True),

@@ -17,6 +17,7 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.engine.fit.densify import DensifyStatistics
 from gsstream.engine.fit.frame_images import FrameImages
+from gsstream.engine.state.drift import Lit
 from gsstream.input.seeds.shell import Shell
 from gsstream.method.base import Step as MethodStep
 from gsstream.packet import PlayerState
@@ -78,6 +79,8 @@ class StreamState:
     refinement: Refinement | None = None
     #: State of the motion part after the packets since the last key packet (``MotionPart.follow``).
     motion_memory: Any = None
+    #: The frame whose light the colours of what stands still have; None before the first that was looked at.
+    lit: Lit | None = field(default=None, compare=False, repr=False)
     #: What the renderer keeps of this scene from one frame to the next. Nothing but time depends on it: a state
     #: without one (the first, a resumed one) goes on to the same bytes.
     session: RenderSession | None = field(default=None, compare=False, repr=False)
@@ -104,8 +107,10 @@ def next_state(motion: MotionPart, state: StreamState, player: PlayerState, rng:
 
     A resumed run calls this for every packet it replays, so it depends on nothing but the packet.
     """
-    decoders = {**state.decoders, **{name: torch.from_numpy(value) for name, value in player.decoders.items()}}
-    after, delta, before = replace(state, player=player, decoders=decoders), player.delta, player.before
+    # What the light brought is not the residual's: a row more of a decoder (``engine.step.light``).
+    own = {n: torch.from_numpy(v[: len(state.decoders.get(n, v))]) for n, v in player.decoders.items()}
+    after = replace(state, player=player, decoders={**state.decoders, **own})
+    delta, before = player.delta, player.before
     if delta is None or before is None:
         return after
     if delta.has_row_edit:

@@ -21,9 +21,11 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.budget.epoch_scheduler import EpochScheduler
 from gsstream.engine.fit.frame_images import FrameImages
+from gsstream.engine.state.drift import INTERVAL
 from gsstream.engine.state.stream_state import Resident, Step, StreamState, next_state, updated
 from gsstream.engine.step.candidates import CHANGE_VOTES, candidates
 from gsstream.engine.step.context import EngineContext
+from gsstream.engine.step.light import Sent, light_drift, relit
 from gsstream.engine.step.metrics import step_numbers
 from gsstream.engine.step.motion import propose_motion
 from gsstream.engine.step.optimise import optimise
@@ -49,12 +51,12 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
     with log.phase("change"):
         images = FrameImages(frame.images, assembly.renderer.device)
         change = find_change(assembly.renderer, state, images, threshold=budget.change_threshold)
-    if change is not None and change.share == 0 and scope is not Scope.ALL:
-        return empty_step(state, frame, log)
-    late = assembly.checks is not Checks.STEP
-    with log.phase("motion"), deferred_checks(late):
+        lit, relights = (state.lit, False) if frame.index % INTERVAL else light_drift(assembly, state, frame, images)
+    if change is not None and change.share == 0 and scope is not Scope.ALL and not relights:
+        return empty_step(replace(state, lit=lit), frame, log)
+    with log.phase("motion"), deferred_checks(assembly.checks is not Checks.STEP):
         motions, scene, work = propose_motion(assembly, state, frame, change=change, tools=tools, images=images)
-    with log.phase("confidence"), deferred_checks(late):
+    with log.phase("confidence"), deferred_checks(assembly.checks is not Checks.STEP):
         rows, logits = select(assembly, work, work.hierarchy, scope)
     with log.phase("optimise"):
         schedule = EpochScheduler(budget, len(frame.cameras), len(rows), frame.epoch_scale)
@@ -78,19 +80,22 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
     with log.phase("code"):
         trim, most = assembly.recipe.codec.trim, budget.max_bytes
         fitted = encode_frame(delta, state.player, frame.index, solution=solution, trim=trim, max_bytes=most)
-        player = decode_packet(state.player, fitted.packet.data)
+        sent = Sent(fitted.delta, fitted.packet, decode_packet(state.player, fitted.packet.data), lit)
+    if relights:
+        with log.phase("optimise/light"):
+            sent = relit(assembly, state, work, sent, max_bytes=most)
     with log.phase("keep"):
         # A frame that changed nothing is not what the scene shows: the next one is compared with the last that did, so
         # that a change too slow to see from frame to frame adds up until it is seen.
-        unchanged = fitted.delta.is_empty
+        unchanged = sent.delta.is_empty
         shown = state.previous if unchanged else replace(frame, images=packed(frame.images))
-        session, resident = keep(work, scene, fitted.delta, player)
-        kept = replace(state, previous=shown, session=session, resident=resident)
-        after = next_state(assembly.motion, kept, player, rng)
+        session, resident = keep(work, scene, sent.delta, sent.player)
+        kept = replace(state, previous=shown, session=session, resident=resident, lit=sent.lit)
+        after = next_state(assembly.motion, kept, sent.player, rng)
     log.set(changed_tiles=1.0 if change is None else change.share, **step_numbers(solution, len(rows), session))
     if (schedule.timed or schedule.sized) and (len(rows) or scope is Scope.NONE):
         log.set(budget=schedule.usage(fitted))
-    return Step(after, replace(fitted.packet, decoded=player), "empty" if unchanged else "delta")
+    return Step(after, replace(sent.packet, decoded=sent.player), "empty" if unchanged else "delta")
 
 
 def find_change(renderer: Renderer, state: StreamState, images: FrameImages, threshold: float) -> Change | None:
@@ -141,9 +146,8 @@ def select(assembly: Assembly, work: EngineContext, hierarchy: Hierarchy, scope:
     seen = work.everywhere() if scope is Scope.ALL else work
     confidence = assembly.propagation.propagate(assembly.confidence.estimate(seen), hierarchy)
     logits = assembly.gate.init(confidence)
-    open_probability = assembly.gate.open_probability(logits)
-    able = seen.changed_rows(CHANGE_VOTES)
-    return Selected(candidates(able, open_probability, hierarchy, assembly.recipe.stream.active_threshold), logits)
+    able, threshold = seen.changed_rows(CHANGE_VOTES), assembly.recipe.stream.active_threshold
+    return Selected(candidates(able, assembly.gate.open_probability(logits), hierarchy, threshold), logits)
 
 
 #: Largest share of changed rows at which the renderer's cache of the other rows saves time.

@@ -1,0 +1,186 @@
+"""The light is followed: colours of what stands still are compared with the images, and change in closed form.
+
+From one frame to the next the light of a room changes by less than the noise of its cameras: no tile counts as changed,
+no Gaussian of a wall takes part, and those that do take part grow over the walls to make up for it. When enough has
+added up (:mod:`gsstream.engine.state.drift`), every Gaussian whose gate stayed closed gets the colour change that its
+pixels ask for: one step of Jacobi on the squared error, in which a row's diagonal is the light it gives to all pixels,
+so that what changes smoothly is met in one step. All change along one colour, sent as one latent more of sh0 with a row
+of its own in the decoder, which the next residual is without.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from gsstream.core.changes import Delta
+from gsstream.core.frame import Frame
+from gsstream.core.gaussians import SH0, Gaussians
+from gsstream.core.shapes import FloatArray
+from gsstream.engine.assembly.assemble import Assembly
+from gsstream.engine.fit.frame_images import FrameImages
+from gsstream.engine.state.drift import INTERVAL, Drift, Lit, drift, looked_at
+from gsstream.engine.state.stream_state import StreamState
+from gsstream.engine.step.context import EngineContext
+from gsstream.engine.step.light_symbols import with_light
+from gsstream.method.packets import delta_packet
+from gsstream.method.tools import Tools
+from gsstream.packet import EncodedPacket, PlayerState, decode_packet
+
+#: Error of a pixel from which it shows something else than the light, image units.
+MOST_ERROR = 0.1
+#: Least pixels' worth of light that a row must give to be asked.
+LEAST_LIGHT = 4.0
+#: Squared error that a bit must save, in mean squared errors of one channel of a pixel, and the factors on it that are
+#: tried where a packet must fit into a budget.
+PRICE, DEARER = 20.0, (1, 4, 16, 64)
+
+
+def follows_light(assembly: Assembly) -> bool:
+    """Say whether the recipe asks for it and the update rule has latents of colour, as one of which it is sent."""
+    code = assembly.update.codes().get("sh0")
+    return assembly.recipe.stream.light > 0 and code is not None and code.latent > 0
+
+
+def light_drift(assembly: Assembly, state: StreamState, frame: Frame, images: FrameImages) -> Drift:
+    """Compare a frame with the one whose light the colours have; nothing is due where they do not follow the light."""
+    if not follows_light(assembly):
+        return Drift(None, False)
+    return drift(state.lit, looked_at(frame.index, images), assembly.recipe.stream.light)
+
+
+def lit_after(assembly: Assembly, state: StreamState, players: Iterable[PlayerState], tools: Tools) -> Lit | None:
+    """Return the frame whose light the colours have, for a stream that is resumed.
+
+    The packets say when the colours last followed it; of the frames since, those that are looked at are read again.
+
+    Arguments:
+        state: at the end of the stream.
+        players: states of players since its last key packet.
+    """
+    if not follows_light(assembly):
+        return None
+    rows = len(state.decoders["sh0"])
+    followed = [player.frame for player in players if _decoder_rows(player) > rows]
+    lit, device = None, assembly.renderer.device
+    first = followed[-1] if followed else state.key_frame + 1
+    for index in range(-(-first // INTERVAL) * INTERVAL, state.player.frame + 1, INTERVAL):
+        now = looked_at(index, FrameImages(tools.recorded(index).as_stored().images, device))
+        lit = drift(lit, now, assembly.recipe.stream.light).lit
+    return lit
+
+
+def _decoder_rows(player: PlayerState) -> int:
+    """Rows of the decoder of sh0 in what a packet changes; 0 without."""
+    residual = None if player.delta is None else player.delta.residual
+    return 0 if residual is None else len(residual.decoders.get("sh0", ()))
+
+
+class Sent(NamedTuple):
+    """What a frame sends.
+
+    Arguments:
+        delta: what changes. packet: its packet. player: the state of every player after it.
+        lit: the frame whose light the colours then have; None: none was looked at.
+    """
+
+    delta: Delta
+    packet: EncodedPacket
+    player: PlayerState
+    lit: Lit | None
+
+
+def relit(assembly: Assembly, state: StreamState, work: EngineContext, sent: Sent, max_bytes: int | None) -> Sent:
+    """Return the frame with the colours of what has not changed brought up to the light of its images.
+
+    A frame in which rows come or go stays as it is, and so does one whose packet would not fit.
+    """
+    if sent.delta.has_row_edit:
+        return sent
+    scene = sent.player.gaussians.map(lambda value: torch.from_numpy(value).to(work.gaussians.means.device))
+    wanted = wanted_colours(assembly, scene, work)
+    work.log.set(camera_drift=np.round(wanted.cameras.mean(1) * 255, 2).tolist())
+    for factor in DEARER:
+        delta = with_light(
+            sent.delta,
+            sent.player.layout,
+            change=wanted.change,
+            worth=wanted.worth,
+            price=factor * PRICE * wanted.error,
+            decoder=state.decoders["sh0"].cpu().numpy(),
+            step=assembly.update.codes()["sh0"].step,
+            levels=assembly.gate.num_levels,
+        )
+        packet = delta_packet(state.player, delta, frame=sent.player.frame)
+        if max_bytes is None or len(packet.data) <= max_bytes:
+            now = sent.lit if delta is sent.delta else looked_at(sent.player.frame, work.images)
+            return Sent(delta, packet, decode_packet(state.player, packet.data), now)
+    return sent
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the images ask of the colours.
+
+    Arguments:
+        change: [N, 3] of sh0.
+        worth: [N] squared error of one channel, summed over pixels, per square of a change.
+        error: mean squared error of one channel of the pixels that were asked.
+        cameras: [V, 3] what each camera shows beyond what all show together, image units. It is reported, not drawn.
+    """
+
+    change: FloatArray
+    worth: FloatArray
+    error: float
+    cameras: FloatArray
+
+
+def wanted_colours(assembly: Assembly, scene: Gaussians[torch.Tensor], work: EngineContext) -> Wanted:
+    """Render the scene in every training view, and return what its pixels ask of the colours."""
+    asked, asked_by_view, light = torch.zeros(len(scene), 3), [], []
+    errors = pixels = 0.0
+    for view in range(len(work.cameras)):
+        colour = scene.sh0.clone().requires_grad_()
+        drawn = assembly.renderer.render(replace(scene, sh0=colour), work.cameras, view, assembly.background).image
+        exposure = work.photometric.exposure[view] if work.photometric.exposure else None
+        shown = exposure.apply(drawn.detach()) if exposure else drawn.detach()
+        error = work.image(view) - shown
+        slow = (error.abs().amax(-1, keepdim=True) < MOST_ERROR).float()
+        error = error * slow
+        upstream = exposure.vjp(error) if exposure else error
+        # The gradient of a pixel by a colour is the share that its Gaussian has of the pixel's light.
+        by_row = torch.autograd.grad(drawn, colour, upstream.contiguous(), retain_graph=True)[0][:, 0].cpu() / SH0
+        shares = torch.autograd.grad(drawn, colour, slow.expand(-1, -1, 3).contiguous())[0][:, 0, 0].cpu() / SH0
+        asked += by_row
+        asked_by_view.append(by_row.sum(0))
+        light.append(shares)
+        errors, pixels = errors + float(error.square().sum()) / 3, pixels + float(slow.sum())
+    weights = torch.stack(light)
+    total = weights.sum(0)
+    cameras = camera_offsets(torch.stack(asked_by_view), asked, weights)
+    left = asked - weights.T @ cameras
+    change = torch.where(total[:, None] > LEAST_LIGHT, left / total.clamp_min(1e-6)[:, None] / SH0, 0.0)
+    return Wanted(change.numpy(), (total * SH0**2).numpy(), errors / max(pixels, 1.0), cameras.numpy())
+
+
+def camera_offsets(asked_by_view: torch.Tensor, asked: torch.Tensor, light: torch.Tensor) -> torch.Tensor:
+    """Return [V, 3]: what each camera asks of all colours it sees, beyond what the others ask of the same.
+
+    The least squares of a colour a row and an offset a camera together, with the rows eliminated; of all solutions the
+    shortest, whose offsets have the mean 0: what all cameras ask for is the light's.
+
+    Arguments:
+        asked_by_view, asked: [V, 3], [N, 3] errors, summed over rows and over views, of which each is a sum over pixels
+            by the light that the row gives them.
+        light: [V, N] that light.
+    """
+    light = light.double()
+    shares = light / light.sum(0).clamp_min(1e-6)
+    matrix = light.sum(1).diag() - shares @ light.T
+    right = asked_by_view.double() - shares @ asked.double()
+    inverse: torch.Tensor = torch.linalg.pinv(matrix, rtol=1e-6, hermitian=True)
+    return (inverse @ right).float()

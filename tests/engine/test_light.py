@@ -1,0 +1,151 @@
+"""The light is followed: what is measured of pictures, what is asked of colours, and what of that is sent."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsstream.core.changes import Delta, Layout, Residual, Scene, apply_delta, sent_rows
+from gsstream.core.gaussians import SH0
+from gsstream.engine.fit.frame_images import FrameImages
+from gsstream.engine.state.drift import Drift, Lit, drift, looked_at, tile_shares
+from gsstream.engine.step.light import camera_offsets
+from gsstream.engine.step.light_symbols import STEP, light_symbols, with_light
+from gsstream.packet import quantise_decoders
+from tests.scenes import make_scene
+
+
+def pictures(rng: np.random.Generator, change: float = 0.0, noise: float = 0.0, seed: int = 0) -> np.ndarray:
+    """Two views [2, 64, 80, 3] float32 of grey levels 60 to 180, brighter by ``change`` levels, with noise."""
+    world = np.random.default_rng(seed).uniform(60, 180, (2, 64, 80, 3))
+    return (world + change + rng.normal(0, noise, world.shape)).astype(np.float32) / np.float32(255)
+
+
+def pixels(images: np.ndarray, stored: str = "float32", frame: int = 0) -> Lit:
+    """What is looked at of pictures [V, H, W, 3] that are stored as bytes or not."""
+    kept = np.rint(images * 255).astype(np.uint8) if stored == "uint8" else images
+    return looked_at(frame, FrameImages(kept, torch.device("cpu")))
+
+
+@pytest.mark.parametrize("stored", ["uint8", "float32"])
+@pytest.mark.parametrize(("change", "share"), [(0.0, 0.0), (2.0, 1.0), (-2.0, 1.0)])
+def test_noise_is_no_drift_and_two_levels_of_light_are(stored: str, change: float, share: float) -> None:
+    """The noise of a pixel is as large as the change; that of the mean of a grid's 16 pixels is half a level."""
+    rng = np.random.default_rng(1)
+    before, now = (pixels(pictures(rng, by, noise=2), stored) for by in (0, change))
+    still, drifted = tile_shares(before, now, levels=1)
+    assert still == 1.0
+    assert drifted == pytest.approx(share, abs=0.1)
+
+
+def test_what_moved_is_not_asked_about_the_light() -> None:
+    """In the left three tiles of five something else stands there; only the others have drifted."""
+    rng = np.random.default_rng(2)
+    before, now = pictures(rng), pictures(rng, 2)
+    now[:, :, :48] = pictures(rng, seed=9)[:, :, :48]
+    assert tile_shares(pixels(before), pixels(now), levels=1) == pytest.approx((2 / 5, 1.0))
+
+
+@pytest.mark.parametrize("size", [(3, 5), (15, 40), (16, 16)])
+def test_small_pictures_have_few_tiles_or_none(size: tuple[int, int]) -> None:
+    before, now = np.zeros((1, *size, 3), np.float32), np.full((1, *size, 3), 4 / 255, np.float32)
+    wanted = (1.0, 1.0) if size == (16, 16) else (0.0, 0.0)
+    assert tile_shares(pixels(before), pixels(now), levels=1) == wanted
+
+
+@pytest.mark.parametrize(("change", "due", "frame"), [(0.4, False, 0), (2.0, True, 0), (80.0, False, 5)])
+def test_the_light_is_due_when_it_drifted_and_starts_anew_after_a_jump(change: float, due: bool, frame: int) -> None:
+    """After a lamp nothing can be told from what moved: the next frames are compared with the present one."""
+    rng = np.random.default_rng(3)
+    before, now = pixels(pictures(rng)), pixels(np.minimum(pictures(rng, change), 1), frame=5)
+    found = drift(before, now, levels=1)
+    assert (found.is_due, found.lit.frame if found.lit else None) == (due, frame)
+    assert drift(None, now, levels=1) == Drift(now, False)
+
+
+def test_rows_and_cameras_share_what_is_asked_for_as_it_came_about() -> None:
+    """Colours change by place and one camera drifts: both are found again, the mean of all cameras in the colours."""
+    rng = np.random.default_rng(3)
+    light = torch.from_numpy(rng.uniform(0, 5, (6, 40)) * (rng.random((6, 40)) < 0.6)).float()
+    places = torch.from_numpy(rng.normal(size=(40, 3))).float()
+    cameras = torch.zeros(6, 3)
+    cameras[2] = torch.tensor([0.6, -0.3, 0.0])
+    asked = light[:, :, None] * (places[None] + cameras[:, None])
+    found = camera_offsets(asked.sum(1), asked.sum(0), light)
+    torch.testing.assert_close(found, cameras - cameras.mean(0), atol=1e-4, rtol=1e-4)
+    left = (asked.sum(0) - light.T @ found) / light.sum(0)[:, None]
+    torch.testing.assert_close(left, places + cameras.mean(0), atol=1e-3, rtol=1e-3)
+
+
+def test_a_row_that_no_camera_sees_asks_for_nothing() -> None:
+    light = torch.tensor([[1.0, 0.0], [2.0, 0.0]])
+    asked = torch.zeros(2, 2, 3)
+    assert torch.equal(camera_offsets(asked.sum(1), asked.sum(0), light), torch.zeros(2, 3))
+
+
+def test_symbols_are_the_best_at_their_price() -> None:
+    """Without a price they are the nearest multiples; with one they lose error and save bits; in the end all are 0."""
+    rng = np.random.default_rng(4)
+    grey = rng.uniform(-3, 3, 500)
+    change, worth = np.outer(grey, np.ones(3) / 3**0.5) * STEP, rng.uniform(1, 50, 500)
+    symbols, direction = light_symbols(change, worth, price=0)
+    np.testing.assert_allclose(np.linalg.norm(direction), STEP, rtol=1e-6)
+    assert np.array_equal(symbols, np.rint(grey * np.sign(direction.sum())))
+    counts, errors = [], []
+    for price in (0, 1e-2, 1e-1, 1, 1e9):
+        symbols, direction = light_symbols(change, worth, price=price)
+        counts.append(np.count_nonzero(symbols))
+        errors.append(float((worth[:, None] * (change - symbols[:, None] * direction) ** 2).sum()))
+    assert counts == sorted(counts, reverse=True)
+    assert errors == sorted(errors)
+    assert counts[-1] == 0
+
+
+def layout_of(counts: list[int]) -> Layout:
+    number = sum(counts)
+    return Layout(np.array(counts, np.int32), np.zeros(number, np.uint8), np.ones(1, np.float32))
+
+
+def residual_of(layout: Layout, gates: list[int], names: tuple[str, ...], step: float) -> Residual | None:
+    """Gates of 10 levels with random symbols of the named attributes; None without an open gate."""
+    rng, opened = np.random.default_rng(5), np.array(gates, np.uint8)
+    if not opened.any():
+        return None
+    rows = len(sent_rows(layout, opened))
+    widths = {"means": 3, "sh0": 2}
+    symbols = {name: rng.integers(-3, 4, (rows, widths[name])).astype(np.int32) for name in names}
+    decoders = quantise_decoders({"sh0": rng.normal(size=(2, 3))} if "sh0" in names else {})
+    return Residual(opened, 10, symbols, dict.fromkeys(names, step), decoders)
+
+
+@pytest.mark.parametrize("gates", [[0, 0, 0, 0], [0, 10, 0, 4]])
+@pytest.mark.parametrize("names", [("means",), ("sh0",), ("means", "sh0")])
+@pytest.mark.parametrize("step", [1.0, 0.75])
+def test_colours_behind_closed_gates_follow_and_the_residual_stays(
+    gates: list[int], names: tuple[str, ...], step: float
+) -> None:
+    layout = layout_of([3, 2, 4, 1])
+    scene = Scene(make_scene(10), layout)
+    residual = residual_of(layout, gates, names, step)
+    before = Delta().with_residual(residual)
+    change = np.full((10, 3), 2 * STEP / 3**0.5)
+    decoder = quantise_decoders({"sh0": np.ones((2, 3))})["sh0"]
+    after = with_light(before, layout, change=change, worth=np.ones(10), price=0, decoder=decoder, step=step, levels=10)
+    plain, lit = apply_delta(scene, before).gaussians, apply_delta(scene, after).gaussians
+    closed = np.array(gates)[layout.node_of] == 0
+    moved = (lit.sh0 - plain.sh0)[:, 0]
+    np.testing.assert_allclose(moved[closed], change[closed], rtol=2e-3)  # decoders are sent in 16 bits
+    np.testing.assert_allclose(moved[~closed], 0, atol=1e-6)
+    for name in ("means", "quats", "scales", "opacities", "shN"):
+        assert np.array_equal(getattr(lit, name), getattr(plain, name)), name
+
+
+def test_nothing_is_sent_where_nothing_is_worth_its_bits() -> None:
+    layout = layout_of([3, 2])
+    small = np.full((5, 3), 0.1 / 255 / SH0)
+    before = Delta()
+    after = with_light(
+        before, layout, change=small, worth=np.ones(5), price=0, decoder=np.ones((2, 3), np.float32), step=1, levels=1
+    )
+    assert after is before

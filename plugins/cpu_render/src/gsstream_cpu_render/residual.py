@@ -65,7 +65,7 @@ class CpuResidualOptimiser(ResidualOptimiser[CpuSession]):
         self._native.decode(*(value.numpy() for value in inputs), *arrays)
         return replace(self._base, **out)
 
-    def backward(self, grad: Gaussians[torch.Tensor], rd_lambda: float) -> torch.Tensor:
+    def backward(self, grad: Gaussians[torch.Tensor], rd_lambda: float | torch.Tensor) -> torch.Tensor:
         upstream = []
         for name in self._code.feature:
             value, like = getattr(grad, name), getattr(self._base, name)
@@ -76,11 +76,11 @@ class CpuResidualOptimiser(ResidualOptimiser[CpuSession]):
         by_gate = torch.empty(len(latents))
         results = [value.numpy() for value in (latents, matrix, by_gate)]
         inputs = self._latents.detach(), self._units, self._gates
-        self._native.backward(*(value.numpy() for value in inputs), upstream, rd_lambda, *results)
+        self._native.backward(*(value.numpy() for value in inputs), upstream, float(rd_lambda), *results)
         self._pending = latents, matrix
         return by_gate
 
-    def step(self, lr_factor: float = 1.0) -> None:
+    def step(self, lr_factor: float | torch.Tensor = 1.0) -> None:
         if self._pending is None:
             refuse("step: expected a backward before it, got none; call forward, backward and step in this order")
         latents, matrix = self._pending

@@ -121,16 +121,20 @@ def test_without_a_gpu_the_cpu_build_of_torch_comes_first(
 def test_commands_of_the_lab_are_known_where_it_is_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    commands = [key.removeprefix("command/") for keys in json.loads(TABLE.read_text()).values() for key in keys]
-    commands = [name for name in commands if "/" not in name]
+    shipped = {
+        name: extra
+        for extra, keys in json.loads(TABLE.read_text()).items()
+        for name in (key.removeprefix("command/") for key in keys)
+        if "/" not in name
+    }
     alone = [plugin for plugin in load_catalog().plugins if plugin.name == "builtin"]
     monkeypatch.setattr("gsstream.cli.table.load_catalog", lambda: load_catalog(alone))
-    assert len(commands) > 6
-    for name in commands:
+    assert len(shipped) > 6
+    for name, extra in shipped.items():
         assert run_command([name, "x"]) == 1
         said = capsys.readouterr().err
         assert said.startswith(f"error: the command {name!r} is not installed here. To install it: ")
-        assert said.rstrip().endswith("'gsstream[s2gs]'")
+        assert said.rstrip().endswith(f"'gsstream[{extra}]'")
     assert run_command(["compaer"]) == 2
     assert "not installed" not in capsys.readouterr().err
 

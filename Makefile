@@ -28,7 +28,7 @@ checksum = $(firstword $(shell cat $(1) | cksum))
 INSTALLED := $(VENV)/.installed-$(call checksum,$(LISTS))
 BUILT := $(VENV)/.built-$(call checksum,$(NATIVE))
 
-.PHONY: demo test check docs gallery dist setup clean
+.PHONY: demo test check test-live docs gallery dist setup clean
 .DEFAULT_GOAL := demo
 
 demo: setup
@@ -53,6 +53,10 @@ test check: setup
 	echo "== pytest"; $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS) || status=1; \
 	echo "== mypy"; wait $$types || { echo "== FAILED: mypy"; status=1; }; cat $(VENV)/mypy.log; \
 	exit $$status
+
+# Network cameras in real time: a minute, and a machine that is not busy.
+test-live: setup
+	$(BIN)/python -m pytest -m live plugins/capture
 
 docs: setup
 	$(BIN)/python -m tools.reference

@@ -27,7 +27,7 @@ ROOT = Path(__file__).parent
 #: while the others wait. A name that is missing here costs only time.
 LONG = (
     "flow/test_closed_loop", "flow/test_kills", "flow/test_repeat_and_resume", "flow/test_resume",
-    "flow/test_key_refresh", "lab/tests/test_sweep_real", "capture/tests/test_faults",
+    "flow/test_key_refresh", "lab/tests/test_sweep_real",
     "cpu_render/tests/test_cross_aarch64", "contract/test_new_plugin", "contract/test_howtos",
     "discovery/test_six_rings", "lab/tests/test_paper_configs", "web/test_page", "flow/test_budget",
     "contract/test_saboteurs", "contract/test_shipped_plugins", "flow/test_no_overshoot", "web/test_live_page",
@@ -76,8 +76,12 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return True if wanted and collection_path.is_file() and not is_quick(collection_path) else None
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the longest files, and mark what ``make check`` runs."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Begin with the longest files, mark what ``make check`` runs, and leave out what happens in real time."""
+    live = [] if "live" in config.option.markexpr else [item for item in items if item.get_closest_marker("live")]
+    if live:
+        config.hook.pytest_deselected(items=live)
+        items[:] = [item for item in items if item not in set(live)]
     places = {name: place for place, name in enumerate(LONG)}
     for item in items:
         if is_quick(item.path):

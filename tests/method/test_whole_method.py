@@ -439,7 +439,9 @@ class TestTools:
 
     def test_a_frame_that_is_worth_less_has_fewer_epochs(self, begun) -> None:
         subject, _, _, now = begun
-        tools = subject.encoder()._tools(unlimited(Stream()))
+        made = subject.encoder()
+        made._unlimited = unlimited(Stream())
+        tools = made._tools()
         assert [tools.epochs(replace(now, epoch_scale=e)) for e in (1.0, 0.5, 0.01)] == [20, 10, 1]
 
 

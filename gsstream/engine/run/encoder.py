@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -180,11 +180,11 @@ class Encoder:
         # The title is what the stream says: equal recipes may be called otherwise by another version.
         meta = end.player.meta
         self.assembly = replace(self.assembly, title=meta.title, background=meta.background)
-        tools = self._tools(
-            replay=lambda: states_since_key(stream, end), recorded=lambda index: self.with_near_plane(image(index))
-        )
+        # The last one is kept, because the frame that the scene shows may be asked for once more.
+        recorded = lru_cache(maxsize=1)(lambda index: self.with_near_plane(image(index)))
+        tools = self._tools(replay=lambda: states_since_key(stream, end), recorded=recorded)
         with one_torch_thread():
-            shown = self.with_near_plane(image(end.shown))
+            shown = recorded(end.shown)
             shown = replace(shown, images=packed(shown.images))
             self.state = run_resume(self.method, end.player, shown, tools)
         return end.player.frame

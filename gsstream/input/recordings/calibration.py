@@ -30,7 +30,7 @@ PER_BYTE = 30
 CALIBRATION_FILE = "cameras.json"
 _KEYS = Keys(
     read="schema name fps frames test_cameras licence cameras",
-    idle="convention source derived_from depth dynamic_mask bounds notes",
+    idle="convention source derived_from depth dynamic_mask bounds units notes",
 )
 _CAMERA_KEYS = Keys(
     read="id split width height K w2c frames distortion fisheye",

@@ -97,7 +97,7 @@ def read(folder: Path, missing: Missing = "skip") -> Recording:
 
 def _load(folder: Path) -> tuple[Path, dict[str, Any]]:
     """What transforms.json holds, else what the files of Blender's splits do: the test cameras are those of two."""
-    if (folder / FILE).is_file():
+    if not (folder / SPLIT_FILE.format("train")).is_file() or (folder / FILE).is_file():
         return folder / FILE, _load_one(folder / FILE)
     whole: dict[str, Any] = {"frames": []}
     for split, names in zip(("train", "val", "test"), _SPLITS, strict=True):

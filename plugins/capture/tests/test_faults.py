@@ -33,7 +33,7 @@ from PIL import Image
 FPS, SIZE, LENGTH = 10, (320, 240), 500
 LOGIN = "opener:pass%2Fword77"
 
-#: They take place in real time, with processes that are stopped and killed, and fail where a machine is too busy for that.
+#: They take place in real time, with processes that are stopped and killed: a machine that is too busy fails them.
 pytestmark = [
     pytest.mark.live,
     pytest.mark.skipif(not has_server(), reason=f"no RTSP server of GStreamer here (apt install {NEEDS})"),

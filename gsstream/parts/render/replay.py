@@ -139,7 +139,7 @@ class Records:
         recorder: of the device.
         keep: number of records that are kept; the one that was used longest ago makes room.
         room: of what has a fixed size in these records; None: nothing has.
-        is_watched: have checks of numbers read with the deferred ones; else :meth:`flags` are for the caller to read.
+        is_watched: have checks of numbers read with the deferred ones; else the caller asks :meth:`held`.
     """
 
     def __init__(self, recorder: Recorder, keep: int = 4, *, room: Room | None = None, is_watched: bool = True) -> None:

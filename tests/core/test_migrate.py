@@ -69,6 +69,15 @@ def test_records_and_calls_that_the_page_tells_to_write_exist() -> None:
     assert len(classes) > 8
 
 
+def test_fields_that_the_page_tells_to_write_exist() -> None:
+    told = [word for _, _, new in rows("What is called, and with what") for word in CODE.findall(new)]
+    fields = [found for text in told for found in re.findall(r"^([A-Z][a-z]\w+)\.(\w+)$", text)]
+    for name, field in fields:
+        record = next(getattr(importlib.import_module(f"gsstream.{d}"), name) for d in DOORS if is_exported(d, name))
+        assert hasattr(record, field) or field in record.__annotations__, f"{name}.{field}"
+    assert len(fields) > 10
+
+
 def test_the_same_names_are_in_the_door_that_is_said() -> None:
     for _, names, new in rows("Names"):
         door = re.fullmatch(r"the same names of `gsstream\.(\w+)`", new)

@@ -4,6 +4,7 @@
 #   make check           the same with the quick tests alone: for every change, in a minute or two on two cores
 #   make docs            the reference pages that are made from the code, in docs/reference/
 #   make gallery         the demo's stream on a page, with what it costs beside it, in runs/gallery/: static files to host
+#   make film            the film at the head of the README, from a run of the demo (minutes); its page needs node and Chromium
 #   make dist            every distribution, as source archive and wheel, in dist/
 #   make PYTHON=python3.12 test    choose the interpreter .venv is made with
 #   make clean           remove .venv and what was built
@@ -28,7 +29,7 @@ checksum = $(firstword $(shell cat $(1) | cksum))
 INSTALLED := $(VENV)/.installed-$(call checksum,$(LISTS))
 BUILT := $(VENV)/.built-$(call checksum,$(NATIVE))
 
-.PHONY: demo test check test-live docs gallery dist setup clean
+.PHONY: demo test check test-live docs gallery film dist setup clean
 .DEFAULT_GOAL := demo
 
 demo: setup
@@ -63,6 +64,9 @@ docs: setup
 
 gallery: $(DEMO_OUT)/stream.gss
 	$(BIN)/python -m tools.gallery $(DEMO_OUT) --out runs/gallery
+
+film: setup
+	$(BIN)/python -m tools.film --out docs/images/film.webp
 
 $(DEMO_OUT)/stream.gss:
 	@$(MAKE) --no-print-directory demo

@@ -85,4 +85,16 @@ def test_the_python_examples_encode_and_play(tmp_path: Path) -> None:
 def test_the_readme_is_short_and_the_pictures_are_small() -> None:
     assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 1000
     pictures = [path for path in (ROOT / "docs").rglob("*") if path.suffix in (".png", ".jpg", ".webp", ".gif")]
-    assert sum(path.stat().st_size for path in pictures) < 300_000
+    film = ROOT / "docs" / "images" / "film.webp"
+    assert sum(path.stat().st_size for path in pictures if path != film) < 300_000
+    assert film.stat().st_size <= 2_500_000
+
+
+def test_the_film_is_an_animation_of_about_a_minute() -> None:
+    with Image.open(ROOT / "docs" / "images" / "film.webp") as film:
+        stays = []
+        for place in range(film.n_frames):
+            film.seek(place)
+            film.load()
+            stays.append(film.info["duration"])
+    assert 50_000 <= sum(stays) <= 75_000

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 
@@ -18,7 +18,3 @@ class Projected:
     colors: torch.Tensor  # [N, 3]
     opacities: torch.Tensor  # [N]
     radii: torch.Tensor  # [N, 2] int32, half the sides of the box in which it is drawn, pixels
-
-    def rows(self, index: torch.Tensor) -> Projected:
-        """Return some of them."""
-        return Projected(*(getattr(self, field.name)[index] for field in fields(self)))

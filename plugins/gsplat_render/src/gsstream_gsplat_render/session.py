@@ -89,7 +89,7 @@ class GsplatSession(ReplayedSession):
         probe: torch.Tensor | None = None,
         tile_mask: torch.Tensor | None = None,
     ) -> RenderOutput:
-        home, (target, shown, grid) = rows.means.device, self._own(view)
+        home, (target, shown, grid) = rows.means.device, self.own(view)
         whole, whole_probe = self._merged(_moved(rows, self._rigs.device), probe)
         mask = None if tile_mask is None else _checked_mask(tile_mask, target).to(self._rigs.device)
         if len(whole) == 0:
@@ -175,7 +175,11 @@ class GsplatSession(ReplayedSession):
         return self._records
 
     def own(self, view: int) -> Own:
-        return self._own(view)
+        if self.fixed is not None:
+            own: Own = self.fixed.own
+            return own
+        shown = None if self._active is None or len(self._scene) == 0 else self._shown_before(view)
+        return Own(self._rig[view], shown, self._rig.grid)
 
     def numbers(self, view: int) -> torch.Tensor:
         return self._rig.numbers(view)
@@ -184,13 +188,6 @@ class GsplatSession(ReplayedSession):
         drawing = copy(self)
         drawing.fixed = seen
         return drawing
-
-    def _own(self, view: int) -> Own:
-        if self.fixed is not None:
-            own: Own = self.fixed.own
-            return own
-        shown = None if self._active is None or len(self._scene) == 0 else self._shown_before(view)
-        return Own(self._rig[view], shown, self._rig.grid)
 
     def _composited(
         self, seen: Projected, edges: torch.Tensor, target: Target, mask: torch.Tensor | None = None

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
-from urllib.parse import parse_qsl, unquote, urlsplit
+from urllib.parse import parse_qsl, unquote
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from ruamel.yaml import YAML
@@ -188,8 +188,3 @@ def _secrets(url: str) -> set[str]:
     found |= {value for _, value in parse_qsl(query)} | {part.partition("=")[2] for part in query.split("&")}
     found |= {unquote(secret) for secret in found}
     return {secret for secret in found if len(secret) > 2}
-
-
-def host_of(url: str) -> str:
-    """Return the host of an address, or the file."""
-    return urlsplit(url).hostname or url if "://" in url else url

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from hypothesis import settings
 
 # Beside other workers a test that spreads over all cores only makes everybody wait. Tests of threads set their numbers
@@ -14,6 +15,11 @@ from hypothesis import settings
 if "PYTEST_XDIST_WORKER" in os.environ:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "GSSTREAM_THREADS"):
         os.environ.setdefault(name, "1")
+
+# Kernels in Triton are run by its interpreter where torch sees no GPU. Triton reads this when it is imported, which
+# torch may do at any time.
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")
 
 # A submission is tested with the same examples as the one before it; everywhere else new ones are tried each time, and
 # what they find becomes an @example.

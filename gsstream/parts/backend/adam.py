@@ -32,15 +32,31 @@ class ReferenceAdam(RowOptimiser):
             check_shape(f"gradient of {name}", gradient, tuple(value.shape))
             _check_size(name, gradient)
             state.steps.add_(1)
-            state.exp_avg.lerp_(gradient, 1 - ADAM_BETAS[0])
-            state.exp_avg_sq.mul_(ADAM_BETAS[1]).addcmul_(gradient, gradient, value=1 - ADAM_BETAS[1])
-            first, second = bias_corrections(value.device)[state.steps.clamp_max(SATURATED)].unbind(1)
-            wide, lr = (-1, *[1] * (value.dim() - 1)), lrs[name]
-            step, denominator = state.exp_avg * first.reshape(wide), state.exp_avg_sq.sqrt() + second.reshape(wide)
-            if isinstance(lr, torch.Tensor):
-                value.addcdiv_(step.mul_(lr), denominator, value=-1)
-            else:
-                value.addcdiv_(step, denominator, value=-lr)
+            self.move(value, gradient, state, bias_corrections(value.device), lr=lrs[name])
+
+    def move(
+        self,
+        value: torch.Tensor,
+        gradient: torch.Tensor,
+        state: AdamState,
+        corrections: torch.Tensor,
+        lr: float | torch.Tensor,
+    ) -> None:
+        """Move a table [n, ...] and both of its moments in place, given a gradient that was checked.
+
+        Arguments:
+            value: the table. gradient: of its shape. state: its steps count this one already.
+            corrections: :func:`bias_corrections`. lr: a number, or a tensor that broadcasts to the table.
+        """
+        state.exp_avg.lerp_(gradient, 1 - ADAM_BETAS[0])
+        state.exp_avg_sq.mul_(ADAM_BETAS[1]).addcmul_(gradient, gradient, value=1 - ADAM_BETAS[1])
+        first, second = corrections[state.steps.clamp_max(len(corrections) - 1)].unbind(1)
+        wide = (-1, *[1] * (value.dim() - 1))
+        step, denominator = state.exp_avg * first.reshape(wide), state.exp_avg_sq.sqrt() + second.reshape(wide)
+        if isinstance(lr, torch.Tensor):
+            value.addcdiv_(step.mul_(lr), denominator, value=-1)
+        else:
+            value.addcdiv_(step, denominator, value=-lr)
 
 
 @functools.cache

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple
 
 import torch
 
@@ -26,9 +26,8 @@ class _Asked(NamedTuple):
     places: tuple[int, ...]
 
 
-@final
 class ReplayedAdam(ReferenceAdam):
-    """Steps are those of the reference, in torch on the device.
+    """Steps are those of the reference, in torch on the device; a renderer may override :meth:`move` with its own.
 
     Arguments:
         recorder: of the device; None: nothing is recorded.

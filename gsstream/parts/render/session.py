@@ -11,6 +11,8 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.changes.motion import GroupTransforms
 from gsstream.core.context import RowGradient, ScreenGradient
+from gsstream.core.deferred import require
+from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.parts.render.backward import backward, gradient_of
 from gsstream.parts.render.images import float_image, spread_to_pixels
@@ -233,6 +235,9 @@ def _compared(
     image = output.image.detach()
     recorded = target.exposure.apply(image) if target.exposure else image
     loss, upstream = target.loss.evaluate(recorded, target.prepared, target.dssim, tiles)
+    # Else a pixel is NaN, or the image is so large that its square overflows.
+    message = "image: expected finite values of ordinary size, got a loss that is not finite"
+    require(loss - loss == 0, lambda: ShapeError(message))
     if target.tile_weights is not None:
         upstream = upstream * spread_to_pixels(target.tile_weights, *image.shape[:2])[..., None]
     return loss, upstream

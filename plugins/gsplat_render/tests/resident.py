@@ -7,20 +7,21 @@ from typing import Any
 
 import pytest
 import torch
+from gsstream_gsplat_render.fused import Fused, FusedAdam, FusedLoss
 from gsstream_gsplat_render.kernels import Kernels
 from gsstream_gsplat_render.rig import Rigs
 from gsstream_gsplat_render.session import GsplatSession
-from torch_kernels import TORCH_KERNELS
+from torch_kernels import TORCH_FUSED, TORCH_KERNELS
 
-from gsstream.backend import RowOptimiser
+from gsstream.backend import Loss, RowOptimiser
 from gsstream.core.part import PartConfig
 from gsstream.parts.backend.base import Renderer
 from gsstream.parts.render.session import RenderOutput
-from gsstream.replay import ReplayedAdam
 from gsstream.testing import MethodUnderTest
 from gsstream.testing.pretend import DEVICE, PretendRecorder, kernel
 
 ON_DEVICE = Kernels(*(kernel(getattr(TORCH_KERNELS, field.name)) for field in fields(Kernels)))
+FUSED_THERE = Fused(*(kernel(getattr(TORCH_FUSED, field.name)) for field in fields(Fused)))
 CPU = torch.device("cpu")
 #: The stand-in's formulas give other last bits on the two devices with an older torch.
 SAME_BITS = pytest.mark.skipif(
@@ -45,8 +46,16 @@ class StandIn(Renderer):
         return torch.device(self.config.place)
 
     @property
+    def loss(self) -> Loss:
+        return FusedLoss(self.fused)
+
+    @property
     def optimiser(self) -> RowOptimiser:
-        return ReplayedAdam(RIGS[self.device.type].recorder)
+        return FusedAdam(self.fused, RIGS[self.device.type].recorder)
+
+    @property
+    def fused(self) -> Fused:
+        return TORCH_FUSED if self.device == CPU else FUSED_THERE
 
     def render(self, gaussians: Any, cameras: Any, view: int, background: Any) -> RenderOutput:
         return self.open(gaussians, None, cameras, background).render(view, gaussians)

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 import torch
+from gsstream_gsplat_render.fused import FusedLoss
 from resident import CPU, DEVICE, SAME_BITS, method_on
 
 from gsstream.core.errors import ComponentError
@@ -23,7 +24,6 @@ from gsstream.engine.frame0.optimise import FirstFrameRun
 from gsstream.engine.step import frame_step
 from gsstream.input.recordings.open import open_source
 from gsstream.parts.motion.newton import DampedNewton
-from gsstream.parts.render.loss import ReferenceLoss
 from gsstream.parts.render.replay import Records
 from gsstream.testing.method_driver import SOURCE
 from gsstream.testing.pretend import PretendDevice
@@ -165,13 +165,13 @@ def test_other_methods_write_the_packets_of_the_processor(frames: list[Frame], n
 
 def with_intruder(monkeypatch: pytest.MonkeyPatch, intruder: Callable[[torch.Tensor], torch.Tensor]) -> None:
     """Put one more line into the loss."""
-    evaluate = ReferenceLoss.evaluate
+    evaluate = FusedLoss.evaluate
 
-    def intruding(self: ReferenceLoss, image: torch.Tensor, *args: Any) -> Any:
+    def intruding(self: FusedLoss, image: torch.Tensor, *args: Any) -> Any:
         value, gradient = evaluate(self, image, *args)
         return value, gradient + 0 * intruder(gradient)
 
-    monkeypatch.setattr(ReferenceLoss, "evaluate", intruding)
+    monkeypatch.setattr(FusedLoss, "evaluate", intruding)
 
 
 def test_one_tensor_of_the_processor_is_refused(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:

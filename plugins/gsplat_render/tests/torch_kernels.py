@@ -1,6 +1,7 @@
-"""gsplat's five functions on the processor: its own torch formulas, and a rasteriser of ours that reads its tiles.
+"""The functions of a GPU on the processor: gsplat's five, and the three in Triton.
 
-gsplat 1.5.3 has torch formulas of four of them (``gsplat.cuda._torch_impl``); that of the fifth needs CUDA. What the
+gsplat 1.5.3 has torch formulas of four of its own (``gsplat.cuda._torch_impl``); that of the fifth needs CUDA, and a
+rasteriser of ours that reads its tiles stands in its place. What the
 kernels leave undefined is NaN here: rows that are not visible, and the alpha of masked tiles.
 """
 
@@ -10,7 +11,12 @@ from typing import Any
 
 import torch
 from gsplat.cuda import _torch_impl as gsplat
+from gsstream_gsplat_render.fused import Fused
 from gsstream_gsplat_render.kernels import Kernels
+
+from gsstream.parts.backend.adam import ReferenceAdam
+from gsstream.parts.render.loss import ReferenceLoss, _windowed, ssim_and_grads
+from gsstream.parts.residual.adam_state import AdamState
 
 NAN = float("nan")
 
@@ -149,3 +155,55 @@ def _tile(
 
 
 TORCH_KERNELS = Kernels(project, harmonics, tiles, offsets, rasterize)
+
+
+def loss_by_tile(
+    image: torch.Tensor, target: torch.Tensor, dssim: float, tile_mask: torch.Tensor | None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    planes, wanted = image.permute(2, 0, 1)[:, None], ReferenceLoss().prepare(target)
+    similar, *grads = ssim_and_grads(planes, wanted)
+    each = torch.lerp((planes - wanted.planes).abs(), 1 - similar, dssim).sum((0, 1))
+    high, wide = -(-image.shape[0] // 16), -(-image.shape[1] // 16)
+    sums = each.new_zeros(high * 16, wide * 16)
+    sums[: image.shape[0], : image.shape[1]] = each
+    sums = sums.reshape(high, 16, wide, 16).sum((1, 3))
+    found = torch.stack([grad[:, 0] for grad in grads])
+    if tile_mask is None:
+        return sums, found
+    near = torch.nn.functional.max_pool2d(tile_mask[None].float(), 3, 1, 1)[0].bool()
+    # Elsewhere the kernel writes nothing.
+    return torch.where(near, sums, 0.0), torch.where(pixels_of(near, image), found, NAN)
+
+
+def gradient_by_pixel(
+    image: torch.Tensor, target: torch.Tensor, by_window: torch.Tensor, dssim: float, tile_mask: torch.Tensor | None
+) -> torch.Tensor:
+    planes, wanted = image.permute(2, 0, 1), ReferenceLoss().prepare(target).planes[:, 0]
+    known = by_window if tile_mask is None else by_window.nan_to_num(0.0)
+    by_mean, by_square, by_product = (_windowed(grad[:, None])[:, 0] for grad in known)
+    by_ssim = by_mean + 2 * planes * by_square + wanted * by_product
+    gradient = ((1 - dssim) * (planes - wanted).sign() - dssim * by_ssim) / image.numel()
+    if tile_mask is not None:
+        gradient = torch.where(pixels_of(tile_mask, image), gradient, 0.0)
+    return gradient.permute(1, 2, 0).contiguous()
+
+
+def pixels_of(tiles: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
+    """[H, W]: the marks of tiles of 16 x 16 pixels, pixel by pixel."""
+    return tiles.repeat_interleave(16, 0).repeat_interleave(16, 1)[: image.shape[0], : image.shape[1]]
+
+
+def move_table(
+    value: torch.Tensor,
+    gradient: torch.Tensor,
+    exp_avg: torch.Tensor,
+    exp_avg_sq: torch.Tensor,
+    steps: torch.Tensor,
+    corrections: torch.Tensor,
+    lr: float | torch.Tensor,
+) -> None:
+    state = AdamState(exp_avg, exp_avg_sq, steps)
+    ReferenceAdam().move(value, gradient, state, corrections, lr=lr)
+
+
+TORCH_FUSED = Fused(loss_by_tile, gradient_by_pixel, move_table)

@@ -13,8 +13,9 @@ import torch
 from pydantic import Field
 
 from gsstream.api import Cameras, Gaussians, PartConfig
-from gsstream.backend import Renderer, RenderOutput, RenderSession, RowOptimiser
+from gsstream.backend import Loss, Renderer, RenderOutput, RenderSession, RowOptimiser
 from gsstream.replay import ReplayedAdam
+from gsstream_gsplat_render.fused import FusedAdam, FusedLoss, load_fused
 from gsstream_gsplat_render.kernels import load_kernels
 from gsstream_gsplat_render.rig import Background, rigs_on
 from gsstream_gsplat_render.session import GsplatSession
@@ -35,14 +36,21 @@ class GsplatRenderer(Renderer):
     def __init__(self, config: PartConfig | None = None) -> None:
         super().__init__(config)
         load_kernels(self.config.device)
+        load_fused(self.config.device)
 
     @property
     def device(self) -> torch.device:
         return torch.device(self.config.device)
 
     @property
+    def loss(self) -> Loss:
+        fused = load_fused(self.config.device)
+        return super().loss if fused is None else FusedLoss(fused)
+
+    @property
     def optimiser(self) -> RowOptimiser:
-        return ReplayedAdam(rigs_on(self.config.device).recorder)
+        fused, recorder = load_fused(self.config.device), rigs_on(self.config.device).recorder
+        return ReplayedAdam(recorder) if fused is None else FusedAdam(fused, recorder)
 
     def render(
         self, gaussians: Gaussians[torch.Tensor], cameras: Cameras, view: int, background: Background

@@ -1,0 +1,90 @@
+"""A step of Adam by rows as one kernel in Triton: ``gsstream.parts.backend.adam`` is its truth."""
+
+# Arguments of a kernel are what Triton makes of them: pointers and values of a program.
+# mypy: disable-error-code="no-untyped-def, untyped-decorator"
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+
+from gsstream.backend import ADAM_BETAS
+
+#: Elements that a program moves.
+BLOCK = 512
+
+
+@triton.jit
+def _move(
+    values,
+    gradients,
+    first,
+    second,
+    steps,
+    corrections,
+    rates,
+    rate,
+    size,
+    width,
+    by_row,
+    by_column,
+    last,
+    slow,
+    slower,
+    as_table: tl.constexpr,
+    block: tl.constexpr,
+):
+    """Both moments and the values of ``block`` elements; row i has taken ``steps[i]`` steps, this one included."""
+    place = tl.program_id(0) * block + tl.arange(0, block)
+    there = place < size
+    row = place // width
+    taken = tl.minimum(tl.load(steps + row, mask=there, other=1), last)
+    gradient = tl.load(gradients + place, mask=there, other=0.0)
+    mean = tl.load(first + place, mask=there, other=0.0)
+    square = tl.load(second + place, mask=there, other=0.0)
+    mean += slow * (gradient - mean)
+    square = square * (1 - slower) + slower * gradient * gradient
+    factor = tl.load(corrections + 2 * taken, mask=there, other=0.0)
+    least = tl.load(corrections + 2 * taken + 1, mask=there, other=1.0)
+    if as_table:
+        rate = tl.load(rates + row * by_row + (place % width) * by_column, mask=there, other=0.0)
+    change = rate * tl.div_rn(mean * factor, tl.sqrt_rn(square) + least)
+    tl.store(first + place, mean, mask=there)
+    tl.store(second + place, square, mask=there)
+    tl.store(values + place, tl.load(values + place, mask=there, other=0.0) - change, mask=there)
+
+
+def move_table(
+    value: torch.Tensor,
+    gradient: torch.Tensor,
+    exp_avg: torch.Tensor,
+    exp_avg_sq: torch.Tensor,
+    steps: torch.Tensor,
+    corrections: torch.Tensor,
+    lr: float | torch.Tensor,
+) -> None:
+    """Move a table [n, ...] and both of its moments in place, as ``ReferenceAdam.move`` does."""
+    if not value.numel():
+        return
+    size, width, is_table = value.numel(), value.numel() // len(value), isinstance(lr, torch.Tensor)
+    rates = lr.expand(len(value), width) if isinstance(lr, torch.Tensor) else value
+    _move[(triton.cdiv(size, BLOCK),)](
+        values=value,
+        gradients=gradient.contiguous(),
+        first=exp_avg,
+        second=exp_avg_sq,
+        steps=steps,
+        corrections=corrections,
+        rates=rates,
+        rate=0.0 if is_table else lr,
+        size=size,
+        width=width,
+        by_row=rates.stride(0),
+        by_column=rates.stride(-1),
+        last=len(corrections) - 1,
+        slow=1 - ADAM_BETAS[0],
+        slower=1 - ADAM_BETAS[1],
+        as_table=is_table,
+        block=BLOCK,
+    )

@@ -1,0 +1,185 @@
+"""The kernels in Triton: on a GPU where there is one, else in Triton's interpreter; and that they compile for GPUs."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from gsstream_gsplat_render import loss
+from gsstream_gsplat_render.fused import FusedAdam, FusedLoss, load_fused
+from torch_kernels import TORCH_FUSED
+
+from gsstream.parts.backend.reference import ReferenceRenderer
+from gsstream.parts.render.loss import ReferenceLoss
+from gsstream.testing import loss as loss_checks
+from gsstream.testing import optimiser as optimiser_checks
+
+pytest.importorskip("triton", reason="needs the package triton, which torch's CUDA builds bring")
+HAS_GPU = torch.cuda.is_available()
+DEVICE = torch.device("cuda" if HAS_GPU else "cpu")
+FUSED: Any = load_fused(DEVICE.type)
+#: No multiple of a tile, less than one, a row of tiles, and tiles whose window leaves the picture.
+SIZES = [(40, 44), (7, 9), (16, 70), (33, 17)]
+
+
+def pair(height: int, width: int, as_bytes: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(height * width)
+    target = torch.rand(height, width, 3, generator=g)
+    image = (target + 0.2 * torch.randn(height, width, 3, generator=g)).clamp(0, 1)
+    image[: height // 2, : width // 3] = target[: height // 2, : width // 3]
+    if as_bytes:
+        target = (target * 255).round().to(torch.uint8)
+    return image.to(DEVICE), target.to(DEVICE)
+
+
+def masks(height: int, width: int) -> list[torch.Tensor | None]:
+    high, wide = -(-height // 16), -(-width // 16)
+    g = torch.Generator().manual_seed(3)
+    some = torch.rand(high, wide, generator=g) < 0.4
+    some[-1, -1] = True
+    return [None, some.to(DEVICE), torch.zeros(high, wide, dtype=torch.bool, device=DEVICE)]
+
+
+@pytest.mark.parametrize("as_bytes", [False, True])
+@pytest.mark.parametrize("size", SIZES)
+def test_the_loss_is_that_of_the_reference_in_every_tile_that_is_asked_for(
+    size: tuple[int, int], as_bytes: bool
+) -> None:
+    image, target = pair(*size, as_bytes)
+    ours, reference = FusedLoss(FUSED), ReferenceLoss()
+    for mask in masks(*size):
+        for dssim in (0.0, 0.2, 1.0):
+            value, gradient = ours.evaluate(image, ours.prepare(target), dssim, mask)
+            want, wanted = reference.evaluate(image, reference.prepare(target), dssim, mask)
+            assert value.dtype == torch.float64
+            assert gradient.is_contiguous()
+            assert abs(value - want) <= 1e-6
+            assert float((gradient - wanted).abs().max()) <= 2e-5 * float(wanted.abs().max()) + 1e-9
+            if mask is not None:
+                outside = ~mask.repeat_interleave(16, 0).repeat_interleave(16, 1)[: size[0], : size[1]]
+                assert not gradient[outside].any()
+
+
+def test_an_image_may_lie_in_any_order_and_what_is_not_asked_for_may_be_anything() -> None:
+    image, target = pair(40, 44, as_bytes=False)
+    ours = FusedLoss(FUSED)
+    want, wanted = ours.evaluate(image, ours.prepare(target), 0.2)
+    planes = image.permute(2, 0, 1).contiguous().permute(1, 2, 0)  # as a rasteriser by channels leaves it
+    value, gradient = ours.evaluate(planes, ours.prepare(target), 0.2)
+    assert value == want
+    assert torch.equal(gradient, wanted)
+    mask = torch.zeros(3, 3, dtype=torch.bool, device=DEVICE)
+    mask[0, 0] = True
+    spoilt = image.clone()
+    spoilt[38:, 38:] = torch.nan  # beyond the windows of the marked tile and of those beside it
+    clean = ours.evaluate(image, ours.prepare(target), 0.2, mask)
+    found = ours.evaluate(spoilt, ours.prepare(target), 0.2, mask)
+    assert found[0] == clean[0]
+    assert torch.equal(found[1], clean[1])
+
+
+def test_a_value_that_is_not_finite_shows_in_the_loss() -> None:
+    for wrong in (torch.nan, torch.inf, 1e30):
+        image, target = pair(33, 17, as_bytes=True)
+        image[20, 4, 1] = wrong
+        value, _ = FusedLoss(FUSED).evaluate(image, FusedLoss(FUSED).prepare(target), 0.2)
+        assert not value.isfinite()
+
+
+@pytest.mark.parametrize("lr", ["number", "scalar", "columns", "rows"])
+def test_a_table_is_moved_as_the_reference_moves_it(lr: str) -> None:
+    g = torch.Generator().manual_seed(5)
+    rows, width = 300, 7  # more than one program, and none of them full
+    rates: dict[str, Any] = {
+        "number": 0.01,
+        "scalar": torch.tensor(0.01),
+        "columns": 0.01 * torch.rand(width, generator=g),
+        "rows": 0.01 * torch.rand(rows, 1, generator=g),
+    }
+    rate = rates[lr] if lr == "number" else rates[lr].to(DEVICE)
+    corrections = torch.rand(6, 2, generator=g).to(DEVICE)
+    made = [torch.randn(rows, width, generator=g), 10 ** torch.empty(rows, width).uniform_(-9, 4, generator=g)]
+    made += [torch.randn(rows, width, generator=g), torch.rand(rows, width, generator=g)]
+    steps = torch.randint(0, 9, (rows,), generator=g, dtype=torch.int32)  # more than the corrections have: the last one
+    ours, theirs = ([x.clone().to(DEVICE) for x in (*made, steps)] for _ in range(2))
+    FUSED.move_table(*ours, corrections, rate)
+    TORCH_FUSED.move_table(*theirs, corrections, rate)
+    assert torch.equal(ours[4], theirs[4])
+    for got, want in zip(ours[:4], theirs[:4], strict=True):
+        assert torch.allclose(got, want, rtol=2e-6, atol=1e-7)
+
+
+def test_where_triton_cannot_compile_the_reference_is_used_with_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: Any) -> Any:
+        raise RuntimeError("Python.h: No such file or directory")
+
+    monkeypatch.setattr(loss, "loss_by_tile", fails)
+    load_fused.cache_clear()
+    with pytest.warns(UserWarning, match=r"torch's own operations.*Python.h.*needs a C compiler"):
+        assert load_fused(DEVICE.type) is None
+    load_fused.cache_clear()
+
+
+class Brings(ReferenceRenderer):  # type: ignore[misc]  # final; only its loss and its optimiser are others
+    """The reference renderer with the kernels' loss and optimiser."""
+
+    loss = property(lambda _: FusedLoss(FUSED))  # type: ignore[assignment]
+    optimiser = property(lambda _: FusedAdam(FUSED, None))  # type: ignore[assignment]
+
+
+CHECKS = [
+    loss_checks.check_loss_reference,
+    loss_checks.check_loss_mask,
+    loss_checks.check_loss_bytes,
+    loss_checks.check_loss_pure,
+    optimiser_checks.check_optimiser_adam,
+    optimiser_checks.check_optimiser_rows,
+    optimiser_checks.check_optimiser_refuses,
+    optimiser_checks.check_residual_optimiser,
+]
+
+
+@pytest.mark.skipif(HAS_GPU, reason="the contract of the renderer itself runs on the GPU")
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+def test_the_contract_of_a_loss_and_of_an_optimiser(check: Any) -> None:
+    check(Brings())
+
+
+COMPILE = """
+import sys
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from gsstream_gsplat_render import adam, loss
+
+KINDS = {"image": "*fp32", "target": "*u8", "tiles": "*u8", "steps": "*i32"}
+POINTERS = "weights sums grads out values gradients first second corrections rates".split()
+NUMBERS = "dssim scale rate slow slower".split()
+
+def compiled(function, **constants):
+    kinds = {**KINDS, **dict.fromkeys(POINTERS, "*fp32"), **dict.fromkeys(NUMBERS, "fp32")}
+    signature = {name: "constexpr" if name in constants else kinds.get(name, "i32") for name in function.arg_names}
+    source = ASTSource(function, signature, constexprs=constants)
+    return triton.compile(source, target=GPUTarget("cuda", int(sys.argv[1]), 32)).asm["cubin"]
+
+found = [compiled(adam._move, as_table=True, block=512)]
+found += [compiled(kernel, as_bytes=True, all_tiles=False) for kernel in (loss._compare, loss._pull_back)]
+assert all(code[:4] == b"\\x7fELF" for code in found)
+print(len(found))
+"""
+
+
+@pytest.mark.parametrize("architecture", ["80", "90"])
+def test_the_kernels_compile_for_a_gpu_that_is_not_here(architecture: str, tmp_path: Path) -> None:
+    """The interpreter takes Python that the compiler refuses."""
+    environment = {**os.environ, "TRITON_INTERPRET": "0", "TRITON_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", COMPILE, architecture], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split()[-1] == "3"

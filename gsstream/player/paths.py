@@ -11,7 +11,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import FloatArray
 from gsstream.core.world import up_direction
-from gsstream.player.region import Region, focus_point, level_axes, recorded_region
+from gsstream.player.region import Region, level_axes, recorded_region
 
 PATHS = ("orbit", "spiral")
 
@@ -89,7 +89,7 @@ def spiral(rig: Cameras, number: int, turns: float = 2.0) -> Cameras:
 
     It is half as wide as the rig itself.
     """
-    focus, up, centers = focus_point(rig), up_direction(rig), rig.centers
+    focus, up, centers = recorded_region(rig).focus, up_direction(rig), rig.centers
     middle = centers.mean(0)
     forward = focus - middle
     if np.linalg.norm(forward) < 1e-3 * rig.extent:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.focus import focus_point, looks_one_way, point_ahead
 from gsstream.core.shapes import FloatArray
 from gsstream.core.world import up_direction
 
@@ -24,10 +25,6 @@ SLACK, SLACK_FACTOR = np.pi / 18, 1.3
 NEAREST, FARTHEST = 0.5, 1.5
 #: Nearer than this to straight up or down (cosine) an azimuth says nothing.
 STEEP = float(np.cos(np.pi / 18))
-#: Mean squared angle between optical axes, radians, below which a calibration cannot say where they meet.
-PARALLEL = 1e-4
-#: Cameras that look apart, but on the whole one way (length of their mean direction), are taken as parallel.
-ONE_WAY = 0.9
 #: Where angles are cut for sorting, radians, and how much wider a gap must be: a tie is not decided by rounding.
 _CUT, _TIE = 1.0, 1e-9
 
@@ -36,7 +33,7 @@ _CUT, _TIE = 1.0, 1e-9
 class Region:
     """Limits of viewpoints around a point."""
 
-    focus: FloatArray  # [3] the point nearest to all optical axes
+    focus: FloatArray  # [3] the point around which a viewer turns
     up: FloatArray  # [3] unit vector
     #: Whether cameras look away from the focus; then angles are those of where they look, else those of where they
     #: stand.
@@ -94,14 +91,6 @@ def recorded_region(rig: Cameras) -> Region:
     )
 
 
-def focus_point(rig: Cameras) -> FloatArray:
-    """Return the point [3] nearest to all optical axes, in the least-squares sense.
-
-    Parallel axes (or a single camera) leave the distance open; then it is the rig's extent in front of its middle.
-    """
-    return _focus(rig)[0]
-
-
 def level_axes(up: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return two unit vectors [3] across ``up``: azimuths 0 and 90 degrees."""
     axis = np.array([1.0, 0, 0]) if abs(up[0]) < 0.9 else np.array([0, 1.0, 0])
@@ -111,18 +100,11 @@ def level_axes(up: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _focus(rig: Cameras) -> tuple[FloatArray, bool]:
-    axes, centers = rig.viewmats[:, 2, :3], rig.centers
-    across = np.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
-    matrix = across.mean(0)
-    ahead = axes.mean(0)
-    length = float(np.linalg.norm(ahead))
-    if np.linalg.det(matrix) >= PARALLEL:
-        focus: FloatArray = np.linalg.solve(matrix, np.einsum("cij,cj->i", across, centers) / len(rig))
-        outward = float(np.einsum("ci,ci->", centers - focus, axes)) >= -1e-9 * len(rig)
-        if not outward or length < ONE_WAY:
-            return focus, outward
-    ahead = ahead / length if length > 1e-3 else axes[0]
-    return np.asarray(centers.mean(0) + rig.extent * ahead), False
+    """The point around which a viewer turns, and whether the cameras look away from the point."""
+    focus = focus_point(rig)
+    outward = float(np.einsum("ci,ci->", rig.centers - focus, rig.viewmats[:, 2, :3])) >= -1e-9 * len(rig)
+    # Cameras that look apart, but on the whole one way, are taken as parallel.
+    return (point_ahead(rig), False) if outward and looks_one_way(rig) else (focus, outward)
 
 
 def _arc(azimuth: FloatArray) -> tuple[float, float] | None:

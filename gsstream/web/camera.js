@@ -43,34 +43,35 @@ export function cameraOf(view, width, height) {
   };
 }
 
-/** Mean squared angle between optical axes below which nothing says where they meet, and the length of their mean. */
-const [PARALLEL, ONE_WAY] = [1e-4, 0.9];
+/** Mean squared angle between optical axes below which nothing says where they meet; the least length of their mean, of
+    cameras that look one way; the weight that draws the point to the middle of the cameras. */
+const [PARALLEL, ONE_WAY, TO_MIDDLE] = [1e-4, 0.9, 1e-4];
 
 /**
  * What views turn around: the point nearest to all optical axes, the direction that is up, and whether the cameras look
- * outward, away from the point. Parallel axes leave the distance open; then it is the rig's extent before its middle.
+ * outward, away from the point. Parallel axes leave the distance open: of cameras that look one way the point is then as
+ * far before their middle as the rig is wide.
  */
 export function pivotOf(views) {
   const mean = (of) => views.reduce((sum, view) => add(sum, of(view), 1 / views.length), [0, 0, 0]);
   const across = (axis, vector) => add(vector, axis, -dot(axis, vector));
-  const columns = [0, 1, 2].map((k) => mean(({ forward }) => across(forward, [0, 1, 2].map((i) => Number(i === k)))));
-  const right = mean(({ eye, forward }) => across(forward, eye));
-  const determinant = dot(columns[0], cross(columns[1], columns[2]));
+  const units = [0, 1, 2].map((k) => [0, 1, 2].map((i) => Number(i === k)));
+  const plain = units.map((one) => mean(({ forward }) => across(forward, one)));
+  const middle = mean(({ eye }) => eye);
+  const right = add(mean(({ eye, forward }) => across(forward, eye)), middle, TO_MIDDLE);
+  const determinant = ([a, b, c]) => dot(a, cross(b, c));
   const up = upOf(views, mean);
   const ahead = mean(({ forward }) => forward);
-  const length = Math.hypot(...ahead);
-  if (determinant >= PARALLEL) {
-    const point = [0, 1, 2].map((k) => {
-      const [a, b, c] = columns.map((column, i) => (i === k ? right : column));
-      return dot(a, cross(b, c)) / determinant;
-    });
+  const oneWay = Math.hypot(...ahead) >= ONE_WAY;
+  if (determinant(plain) >= PARALLEL || !oneWay) {
+    const columns = plain.map((column, k) => add(column, units[k], TO_MIDDLE));
+    const point = [0, 1, 2].map((k) => determinant(columns.map((column, i) => (i === k ? right : column))) / determinant(columns));
     const inward = views.reduce((sum, { eye, forward }) => sum - dot(add(eye, point, -1), forward), 0);
     const outward = inward <= 1e-9 * views.length;
-    if (!outward || length < ONE_WAY) return { point, up, outward };
+    if (!outward || !oneWay) return { point, up, outward };
   }
-  const middle = mean(({ eye }) => eye);
   const extent = 1.1 * Math.max(...views.map(({ eye }) => Math.hypot(...add(eye, middle, -1)))) || 1;
-  return { point: add(middle, length > 1e-3 ? unit(ahead) : views[0].forward, extent), up, outward: false };
+  return { point: add(middle, unit(ahead), extent), up, outward: false };
 }
 
 /**

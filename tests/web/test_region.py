@@ -55,6 +55,8 @@ RIGS: dict[str, tuple[Cameras, bool, float | None]] = {
     "four around": (rig_of(ring(4), (0, 0, 0)), False, None),
     "three around": (rig_of(ring(3), (0, 0, 0)), False, 240),
     "two opposite": (rig_of(ring(2), (0, 0, 0.5)), False, 180),
+    "two face to face": (rig_of(ring(2, height=0), (0, 0, 0)), False, 180),
+    "two back to back": (rig_of(ring(2, height=0), 2 * ring(2, height=0)), True, 180),
     "arc": (rig_of(ring(8, np.pi / 2), (0, 0, 0)), False, 90),
     "arc, and one from above": (rig_of([*ring(8, np.pi / 2), (1e-12, 0, 4)], (0, 0, 0)), False, 90),
     "dome": (rig_of(np.concatenate([ring(8, height=h) for h in (-2.0, 0.5, 4.0)]), (0.1, 0, 0)), False, None),

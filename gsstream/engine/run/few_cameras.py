@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.focus import focus_point
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.regularisers import choose_regularisers
-from gsstream.input.seeds.geometry import focus_point
 from gsstream.input.seeds.room import stands_around
 from gsstream.input.seeds.shell import SEEDS
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.focus import meeting_point
 from gsstream.core.frame import PointCloud
 from gsstream.core.projection import unproject
 from gsstream.core.shapes import FloatArray
 from gsstream.input.prepare.findings import Finding, error, warning
-from gsstream.input.seeds.geometry import depth_range, focus_point, visible_views
+from gsstream.input.seeds.geometry import depth_range, visible_views
 
 FAR = 30.0
 MIN_OVERLAP = 0.05
@@ -114,9 +115,9 @@ def _points_unit(cameras: Cameras, points: PointCloud) -> list[Finding]:
 
 def check_axes(cameras: Cameras) -> list[Finding]:
     """Find cameras that have the point where their axes meet behind them."""
-    if len(cameras) < 3:
+    focus = meeting_point(cameras)
+    if len(cameras) < 3 or focus is None:
         return []
-    focus = focus_point(cameras)
     depth = (cameras.viewmats[:, 2, :3] @ focus) + cameras.viewmats[:, 2, 3]
     across = np.linalg.norm(cameras.viewmats[:, 2, :3] - cameras.viewmats[:, 2, :3].mean(0), axis=1)
     if (depth < 0).all() and float(across.mean()) > 0.1:

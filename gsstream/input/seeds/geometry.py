@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.focus import focus_point
 from gsstream.core.projection import inside, project
 from gsstream.core.shapes import BoolArray, FloatArray, IntArray
 
@@ -29,19 +30,6 @@ def pixel_centers(width: int, height: int) -> FloatArray:
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
-def focus_point(cameras: Cameras) -> FloatArray:
-    """Return the point [3] nearest to all optical axes (least squares).
-
-    For parallel axes it is drawn weakly to the cameras.
-    """
-    axes, centers = cameras.viewmats[:, 2, :3], cameras.centers
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    weak = 1e-4 * len(cameras)
-    right = np.einsum("cij,cj->i", across, centers) + weak * centers.mean(0)
-    focus: FloatArray = np.linalg.solve(across.sum(0) + weak * np.eye(3), right)
-    return focus
-
-
 def spread_views(cameras: Cameras, count: int) -> IntArray:
     """Return [min(count, C)], ascending: cameras that stand far apart, the first of them farthest from the middle."""
     gaps = np.linalg.norm(cameras.centers[:, None] - cameras.centers[None], axis=2)
@@ -58,7 +46,7 @@ def depth_range(cameras: Cameras, near: float = 0.3, far: float = 4.0) -> FloatA
     centers = cameras.centers
     gaps = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     distance = np.linalg.norm(centers - focus_point(cameras), axis=1)
-    # With parallel axes the focus lies at the cameras themselves; then the size of the rig is taken as the distance.
+    # Cameras that look outwards have the focus among them; then the size of the rig is taken as the distance.
     distance = np.maximum(distance, max(float(gaps.max()), 1e-6) * 0.25)
     return np.stack([near * distance, np.maximum(far * distance, 1.3 * gaps.max(1))], axis=1)
 

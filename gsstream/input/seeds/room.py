@@ -19,11 +19,12 @@ import torch
 import torch.nn.functional as F
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.focus import focus_point
 from gsstream.core.progress import Tell, silent
 from gsstream.core.projection import inside, project
 from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.input.seeds.fusion import agreement, world_points
-from gsstream.input.seeds.geometry import focus_point, neighbour_views, pixel_centers, spread_views
+from gsstream.input.seeds.geometry import neighbour_views, pixel_centers, spread_views
 from gsstream.input.seeds.window import window_mean
 from gsstream.input.seeds.workers import one_thread_each
 

@@ -14,10 +14,10 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
+from gsstream.core.focus import meeting_point
 from gsstream.core.frame import PointCloud
 from gsstream.core.projection import inside, project
 from gsstream.core.shapes import BoolArray, FloatArray
-from gsstream.input.seeds.geometry import focus_point
 
 #: Seeds of the sphere.
 SEEDS = 256
@@ -50,11 +50,11 @@ def mean_color(images: FloatArray) -> tuple[float, float, float]:
 
 def find_shell(cameras: Cameras) -> Shell:
     """Return the sphere of a rig: around what its cameras look at, else (side by side, outwards) around themselves."""
-    centers, focus = cameras.centers, focus_point(cameras)
-    depth = np.einsum("ci,ci->c", cameras.viewmats[:, 2, :3], focus - centers)
+    centers, focus = cameras.centers, meeting_point(cameras)
+    depth = np.zeros(1) if focus is None else np.einsum("ci,ci->c", cameras.viewmats[:, 2, :3], focus - centers)
     widest = np.linalg.norm(centers[:, None] - centers[None], axis=2).max(initial=0)
-    # Axes that are all but parallel meet anywhere, also right before the lenses; those of one place meet there.
-    if widest > 0 and (depth > 0.25 * widest).all():
+    # Axes that are nearly parallel may meet right before the lenses; those of one place meet there.
+    if focus is not None and widest > 0 and (depth > 0.25 * widest).all():
         radius = RADIUS * float(np.linalg.norm(centers - focus, axis=1).mean())
     else:
         focus, radius = centers.mean(0), OUTWARD_RADIUS * cameras.extent

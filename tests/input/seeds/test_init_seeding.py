@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError, ShapeError
+from gsstream.core.focus import focus_point
 from gsstream.core.frame import PointCloud
 from gsstream.core.projection import project, unproject
 from gsstream.input.recordings.primitives import cast
@@ -18,7 +19,7 @@ from gsstream.input.recordings.synthetic import SyntheticSource
 from gsstream.input.seeds import seeding
 from gsstream.input.seeds.aggregate import aggregate, best_plane
 from gsstream.input.seeds.fusion import agreement, color_gains, interpolate_depths
-from gsstream.input.seeds.geometry import depth_range, focus_point, neighbour_views, visible_views
+from gsstream.input.seeds.geometry import depth_range, neighbour_views, visible_views
 from gsstream.input.seeds.seeding import photo_consistent_seeds
 from gsstream.input.seeds.sweep import SweepSettings
 from gsstream.input.seeds.thinning import thin_points

@@ -12,11 +12,12 @@ from rigs import HEIGHT, WIDTH, in_line, inwards, looking, on_arc, outwards, par
 from scipy.ndimage import uniform_filter
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.focus import focus_point
 from gsstream.core.projection import project
 from gsstream.engine.run.encoder import one_torch_thread
 from gsstream.input.seeds import room
 from gsstream.input.seeds.fusion import world_points
-from gsstream.input.seeds.geometry import focus_point, spread_views
+from gsstream.input.seeds.geometry import spread_views
 from gsstream.input.seeds.room import (
     MOST_CAMERAS,
     Room,

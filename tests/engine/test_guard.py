@@ -296,7 +296,7 @@ class TestGuard:
         assert unwrapped(AlwaysOpen()) == AlwaysOpen()
 
     def test_nothing_is_guarded_twice(self) -> None:
-        again = guard("gate", self.part(), Where(), self.part()._level)
+        again = guard("gate", self.part(), Where(), self.part()._use.level)
         assert isinstance(again, Guarded)
         assert type(unwrapped(again)) is AlwaysOpen
 

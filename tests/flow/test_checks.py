@@ -17,7 +17,7 @@ from gsstream.core.errors import ComponentError, GsstreamError, InputError
 from gsstream.discovery.catalog import load_catalog
 from gsstream.engine.assembly import checks as checks_module
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.assembly.checks import Checks, Look, requested_checks
+from gsstream.engine.assembly.checks import Checks, PartInUse, requested_checks
 from gsstream.engine.assembly.fault import Where
 from gsstream.engine.run.recording import open_recording
 from gsstream.engine.run.session import run
@@ -286,8 +286,8 @@ def test_a_wrong_level_ends_the_command_before_anything_is_written(
     assert not (tmp_path / "o").exists()
 
 
-def look_at(level: Checks = Checks.FRAME, iteration: int | None = None) -> Look:
-    return Look(level, "gate", AlwaysOpen(), Where(7, iteration))
+def look_at(level: Checks = Checks.FRAME, iteration: int | None = None) -> PartInUse:
+    return PartInUse("gate", AlwaysOpen(), Where(7, iteration), level)
 
 
 def test_the_first_wrong_number_is_named_with_its_gaussian() -> None:

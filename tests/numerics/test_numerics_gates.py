@@ -15,7 +15,7 @@ from numeric_scenes import some
 
 from gsstream.core.errors import ComponentError
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.engine.assembly.checks import Checks, Look
+from gsstream.engine.assembly.checks import Checks, PartInUse
 from gsstream.engine.assembly.fault import Where
 from gsstream.engine.step.optimise import count_dead_gates
 from gsstream.parts.gate.always_open import AlwaysOpen
@@ -176,7 +176,7 @@ def test_a_residual_that_diverged_is_refused_by_name() -> None:
     part = ExpectedSparsity()
     found = part.penalty(torch.ones(1), torch.full((2, 3), 1e30), flat(1, 2), 2)
     with pytest.raises(ComponentError, match=r"penalty 'motion': expected one finite number, got inf"):
-        Look(Checks.FRAME, "regularizer", part, Where(3, 5)).terms(found)
+        PartInUse("regularizer", part, Where(3, 5), Checks.FRAME).terms(found)
 
 
 @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
@@ -13,10 +12,10 @@ from gsstream.core.errors import InputError, UnknownName
 from gsstream.core.kinds import PART_KINDS
 from gsstream.core.part import Part
 from gsstream.discovery.catalog import Catalog
-from gsstream.engine.assembly.checks import Checks, requested_checks
+from gsstream.engine.assembly.checks import Checks, PartInUse, requested_checks
 from gsstream.engine.assembly.choose_renderer import Chosen, choose_renderer, construct
 from gsstream.engine.assembly.fault import Where
-from gsstream.engine.assembly.guard import error_context, guard
+from gsstream.engine.assembly.guard import guard
 from gsstream.engine.assembly.recipe_keys import unused_keys
 from gsstream.engine.assembly.slots import SLOTS, LiveParts
 from gsstream.engine.assembly.title import title
@@ -65,12 +64,9 @@ class Assembly(LiveParts):
         part: Part = getattr(self, slot).__wrapped__
         return part
 
-    def blame(self, slot: str) -> AbstractContextManager[None]:
-        """Return a context in which errors are those of the part of a slot: they name it, the frame and the iteration.
-
-        Raises ComponentError, as :func:`gsstream.engine.assembly.guard.error_context` says.
-        """
-        return error_context(slot, self.part(slot), self.where)
+    def use(self, slot: str) -> PartInUse:
+        """Return the part of a slot as it is used here: to name it in errors, and to check its values."""
+        return PartInUse(slot, self.part(slot), self.where, self.checks)
 
     @property
     def resolved(self) -> ResolvedRecipe:

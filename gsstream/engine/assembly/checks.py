@@ -6,16 +6,18 @@ Nothing that is sent depends on the level: it decides when a wrong number is not
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from copy import copy
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
 
 import torch
 
-from gsstream.core.deferred import require
-from gsstream.core.errors import InputError
-from gsstream.engine.assembly.fault import Where, fault
+from gsstream.core.deferred import MakeError, named_checks, require
+from gsstream.core.errors import ComponentError, GsstreamError, InputError, ShapeError
+from gsstream.engine.assembly.fault import Where, fault, line_of
 
 VARIABLE = "GSSTREAM_CHECKS"
 UNIT = (0.0, 1.0)
@@ -47,14 +49,34 @@ def requested_checks(given: str | None = None) -> Checks:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """Checks the values that one part returned."""
+class PartInUse:
+    """A part in its slot, while a run calls it: makes the errors about the part, and checks the values it returns."""
 
-    level: Checks  # how closely
-    #: slot, part: whose it is.
     slot: str
     part: object
     where: Where  # the frame and iteration that an error names
+    level: Checks  # how closely values are looked at
+
+    @contextmanager
+    def errors(self) -> Iterator[None]:
+        """Turn an error of the part into a ComponentError with slot, part, distribution, frame and iteration.
+
+        A ShapeError is turned, too: it says that this part refuses what another part gave it. Of a renderer so is every
+        InputError, because a renderer is given nothing but arrays. Other errors of gsstream pass unchanged.
+        """
+        try:
+            with named_checks(self._named):
+                yield
+        except GsstreamError as error:
+            if isinstance(error, ShapeError) or (self.slot == "renderer" and isinstance(error, InputError)):
+                raise self.fault(str(error)) from error
+            raise
+        except Exception as error:
+            raise self.fault(f"{type(error).__name__}: {error}{line_of(error, self.part)}") from error
+
+    def _named(self, error: MakeError) -> MakeError:
+        """Makes the error of a check that is read later one about this part, at the present place."""
+        return partial(_as_fault, replace(self, where=copy(self.where)), error)
 
     def output(
         self, what: str, value: object, shape: tuple[int, ...], limits: tuple[float, float] | None = None
@@ -69,10 +91,10 @@ class Look:
         if tuple(value.shape) != shape:
             raise self.fault(f"{what}: expected shape {list(shape)}, got {list(value.shape)}")
         least = Checks.FRAME if self.where.iteration is None else Checks.STEP
-        if self.looks(least):
+        if self.is_level(least):
             self.values(what, value, limits=limits)
 
-    def looks(self, least: Checks) -> bool:
+    def is_level(self, least: Checks) -> bool:
         """Say whether the level is at least this one."""
         order = list(Checks)
         return order.index(self.level) >= order.index(least)
@@ -120,9 +142,18 @@ class Look:
     def _not_finite(self, name: str, value: torch.Tensor) -> Exception:
         return self.fault(f"penalty {name!r}: expected one finite number, got {float(value)}")
 
-    def fault(self, message: str) -> Exception:
+    def fault(self, message: str) -> ComponentError:
         """Return the error about this part, here and now."""
         return fault(message, self.slot, self.part, self.where)
+
+
+def _as_fault(use: PartInUse, error: MakeError) -> Exception:
+    found = error()
+    if isinstance(found, ComponentError):
+        return found
+    named = use.fault(str(found))
+    named.__cause__ = found
+    return named
 
 
 def wrong_value(

@@ -1,9 +1,11 @@
-"""The error about a part that failed: slot, part, distribution, place and frame."""
+"""The error about a part that failed: slot, part, distribution, place and frame; and the line that failed."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib.metadata import entry_points, packages_distributions
+from pathlib import Path
+from traceback import walk_tb
 
 from gsstream.core.errors import ComponentError
 from gsstream.spec import ENTRY_POINT_GROUP
@@ -40,6 +42,16 @@ def fault(message: str, slot: str, part: object, where: Where | None = None) -> 
     return ComponentError(
         message, slot=slot, part=type(part).__name__, distribution=owner, frame=place.frame, iteration=place.iteration
     )
+
+
+def line_of(error: Exception, part: object) -> str:
+    """Return the line of the part's own package that was being run, as `` (gate.py:42)``."""
+    package = type(part).__module__.partition(".")[0]
+    found = ""
+    for frame, line in walk_tb(error.__traceback__):
+        if str(frame.f_globals.get("__name__", "")).partition(".")[0] == package:
+            found = f" ({Path(frame.f_code.co_filename).name}:{line})"
+    return found
 
 
 def _distribution(package: str) -> str:

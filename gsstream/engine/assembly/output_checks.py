@@ -10,58 +10,58 @@ from typing import Any
 import torch
 
 from gsstream.core.changes import Field, Motion, RowEdit
-from gsstream.engine.assembly.checks import UNIT, Checks, Look
+from gsstream.engine.assembly.checks import UNIT, Checks, PartInUse
 
 
-def _estimate(look: Look, args: tuple[Any, ...], result: object) -> None:
-    look.output("estimate()", result, (args[0].hierarchy.num_gaussians,))
+def _estimate(use: PartInUse, args: tuple[Any, ...], result: object) -> None:
+    use.output("estimate()", result, (args[0].hierarchy.num_gaussians,))
 
 
-def _propagate(look: Look, args: tuple[Any, ...], result: object) -> None:
-    look.output("propagate()", result, (args[1].num_nodes,))
+def _propagate(use: PartInUse, args: tuple[Any, ...], result: object) -> None:
+    use.output("propagate()", result, (args[1].num_nodes,))
 
 
-def _like_logits(what: str, limits: tuple[float, float] | None) -> Callable[[Look, tuple[Any, ...], object], None]:
-    def looking(look: Look, args: tuple[Any, ...], result: object) -> None:
-        look.output(what, result, tuple(args[0].shape), limits)
+def _like_logits(what: str, limits: tuple[float, float] | None) -> Callable[[PartInUse, tuple[Any, ...], object], None]:
+    def check(use: PartInUse, args: tuple[Any, ...], result: object) -> None:
+        use.output(what, result, tuple(args[0].shape), limits)
 
-    return looking
-
-
-def _penalty(look: Look, args: tuple[Any, ...], result: Mapping[str, torch.Tensor]) -> None:
-    look.terms(result)
+    return check
 
 
-def _motion(look: Look, args: tuple[Any, ...], result: object) -> None:
+def _penalty(use: PartInUse, args: tuple[Any, ...], result: Mapping[str, torch.Tensor]) -> None:
+    use.terms(result)
+
+
+def _motion(use: PartInUse, args: tuple[Any, ...], result: object) -> None:
     if not isinstance(result, tuple) or not all(isinstance(motion, Motion | Field) for motion in result):
-        raise look.fault(f"propose(): expected a tuple of Motion or Field, got {type(result).__name__}")
+        raise use.fault(f"propose(): expected a tuple of Motion or Field, got {type(result).__name__}")
 
 
-def _growth(look: Look, args: tuple[Any, ...], result: object) -> None:
+def _growth(use: PartInUse, args: tuple[Any, ...], result: object) -> None:
     if result is not None and not isinstance(result, RowEdit):
-        raise look.fault(f"propose(): expected RowEdit or None, got {type(result).__name__}")
+        raise use.fault(f"propose(): expected RowEdit or None, got {type(result).__name__}")
     if result is not None and result.added is not None:
         for name, value in result.added.gaussians.items():
-            look.values(f"added: {name}", torch.as_tensor(value))
+            use.values(f"added: {name}", torch.as_tensor(value))
 
 
-def _image(look: Look, args: tuple[Any, ...], result: Any) -> None:
-    if look.level is Checks.STEP:
+def _image(use: PartInUse, args: tuple[Any, ...], result: Any) -> None:
+    if use.level is Checks.STEP:
         view = next((arg for arg in args if isinstance(arg, int)), None)
-        look.values("image" if view is None else f"image of view {view}", result.image)
+        use.values("image" if view is None else f"image of view {view}", result.image)
 
 
-def _loss(look: Look, args: tuple[Any, ...], result: Any) -> None:
-    if look.level is Checks.STEP:
-        look.values("loss", result[0])
-        look.values("gradient of the image", result[1])
+def _loss(use: PartInUse, args: tuple[Any, ...], result: Any) -> None:
+    if use.level is Checks.STEP:
+        use.values("loss", result[0])
+        use.values("gradient of the image", result[1])
 
 
-def _optimiser(look: Look, args: tuple[Any, ...], result: object) -> None:
-    look.step_values("after the step,", args[0])
+def _optimiser(use: PartInUse, args: tuple[Any, ...], result: object) -> None:
+    use.step_values("after the step,", args[0])
 
 
-OUTPUT_CHECKS: Mapping[tuple[str, str], Callable[[Look, tuple[Any, ...], Any], None]] = {
+OUTPUT_CHECKS: Mapping[tuple[str, str], Callable[[PartInUse, tuple[Any, ...], Any], None]] = {
     ("confidence", "estimate"): _estimate,
     ("propagation", "propagate"): _propagate,
     ("gate", "init"): _like_logits("init()", None),

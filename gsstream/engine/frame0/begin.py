@@ -107,7 +107,7 @@ def sort_into_nodes(
 ) -> tuple[Hierarchy, torch.Tensor, Gaussians[torch.Tensor]]:
     """Group the Gaussians and store them node by node: (hierarchy, levels, Gaussians), all in the new order."""
     hierarchy = assembly.structure.build(gaussians, anchors)
-    with assembly.blame("structure"):
+    with assembly.use("structure").errors():
         hierarchy.validate()
     edit = sort_by_node(hierarchy.node_of)
     return hierarchy.rows(edit.source), levels[edit.source], gaussians.rows(edit.source)

@@ -19,7 +19,7 @@ from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.picture_size import area_price, densify_factor, prune_factor
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.assembly.checks import VARIABLE, Checks, Look
+from gsstream.engine.assembly.checks import VARIABLE, Checks, PartInUse
 from gsstream.engine.fit import constants
 from gsstream.engine.fit.densify import DensifyStatistics, GrowthLimits, grow_and_prune
 from gsstream.engine.fit.exposure import ExposureFit
@@ -125,9 +125,9 @@ def optimise_first_frame(
     exposure = run.exposure.centered().exposure.to(CPU) if run.exposure else None
     found = run.gaussians().map(lambda value: value.detach().to(CPU))
     assembly.where.enter(frame.index)
-    look = Look(assembly.checks, "first frame", run.table, assembly.where)
+    use = PartInUse("first frame", run.table, assembly.where, assembly.checks)
     for name, values in found.items():
-        look.values(f"{name} after the last iteration ({VARIABLE}=step finds the first)", values)
+        use.values(f"{name} after the last iteration ({VARIABLE}=step finds the first)", values)
     return Reconstruction(found, run.levels.to(CPU), exposure, pyramid.iterations)
 
 
@@ -170,8 +170,8 @@ class FirstFrameRun:
         self.statistics = DensifyStatistics.zeros(len(start), self.device)
         self.regularisers = choose_regularisers(self.settings, frame.cameras)
         self.dropout = Dropout(self.regularisers.dropout, self.views, generator)
-        #: [N] row of ``start`` that each Gaussian comes from.
-        self.came_from = torch.arange(len(start), device=self.device)
+        #: [N] row of ``start`` that each Gaussian descends from.
+        self.ancestors = torch.arange(len(start), device=self.device)
         self.order: list[int] = []
         #: Mean loss of the last iterations, and the losses [] that are not in it yet.
         self.smooth = math.nan
@@ -279,7 +279,7 @@ class FirstFrameRun:
         limits = GrowthLimits(gradient, self.settings.max_gaussians, self.extent, self.widest)
         edit, values = grow_and_prune(gaussians, self.statistics, limits, self.generator)
         self.table.edit(edit, values)
-        self.levels, self.came_from = self.levels[edit.source], self.came_from[edit.source]
+        self.levels, self.ancestors = self.levels[edit.source], self.ancestors[edit.source]
         self.statistics = DensifyStatistics.zeros(len(self.levels), self.device)
 
     def _prune(self) -> None:
@@ -290,7 +290,7 @@ class FirstFrameRun:
         least = self.settings.prune_error * prune_factor(self.whole.cameras.width)
         rows = prune_by_error(views, gaussians, self.generator, least)
         self.table.select_rows(rows)
-        self.levels, self.came_from = self.levels[rows], self.came_from[rows]
+        self.levels, self.ancestors = self.levels[rows], self.ancestors[rows]
         self.statistics = DensifyStatistics.zeros(len(rows), self.device)
 
     def _next_view(self) -> int:

@@ -113,7 +113,7 @@ def advance_refinement(
         pass
     moments = {name: {key: value.to(CPU) for key, value in run.table.moments(name).items()} for name in ATTRIBUTES}
     found = run.gaussians().map(lambda value: value.detach().to(CPU))
-    ancestors = start.ancestors[run.came_from.to(CPU)]
+    ancestors = start.ancestors[run.ancestors.to(CPU)]
     return Refinement(
         gaussians=found,
         levels=run.levels.to(CPU),

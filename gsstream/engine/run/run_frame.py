@@ -11,7 +11,6 @@ from gsstream.core.errors import ComponentError, ShapeError
 from gsstream.core.frame import Frame
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import Checks
-from gsstream.engine.assembly.fault import fault
 from gsstream.engine.frame0.begin import check_cameras
 from gsstream.engine.run.parts_method import PartsMethod
 from gsstream.engine.run.player_difference import difference_between
@@ -50,9 +49,9 @@ def run_frame(method: StreamingMethod[Any], state: Any, frame: Frame, tools: Run
     def work(frame: Frame) -> Step[Any]:
         given = _given(method, frame)
         tools.assembly.where.enter(frame.index)
-        with tools.assembly.blame(SLOT):
+        with tools.assembly.use(SLOT).errors():
             step = method.begin(given, tools) if state is None else method.step(state, given, tools)
-        _check_step(method, None if state is None else state.player, step, frame=frame, tools=tools)
+        _check_step(None if state is None else state.player, step, frame, tools)
         return step
 
     if state is None:
@@ -77,10 +76,10 @@ def run_follow_up(
     """
 
     def work(frame: Frame) -> Step[Any]:
-        with tools.assembly.blame(SLOT), tools.log.phase("other"):
+        with tools.assembly.use(SLOT).errors(), tools.log.phase("other"):
             found = method.follow_up(state, step, _given(method, frame), tools)
         if found is not step:
-            _check_follow_up(method, step, found, tools)
+            _check_follow_up(step, found, tools)
         return found
 
     found, error = _tried(work, frame, tools)
@@ -93,7 +92,7 @@ def run_follow_up(
 def run_resume(method: StreamingMethod[Any], player: PlayerState, shown: Frame, tools: RunTools) -> Any:
     """Return the state of the method after the last packet of a stream."""
     tools.assembly.where.enter(player.frame)
-    with tools.assembly.blame(SLOT):
+    with tools.assembly.use(SLOT).errors():
         return method.resume(player, _given(method, shown), tools)
 
 
@@ -116,14 +115,11 @@ def _given(method: StreamingMethod[Any], frame: Frame) -> Frame:
     return frame if isinstance(method, PartsMethod) else frame.as_float32()
 
 
-def _check_step(
-    method: StreamingMethod[Any], before: PlayerState | None, step: Step[Any], frame: Frame, tools: RunTools
-) -> None:
+def _check_step(before: PlayerState | None, step: Step[Any], frame: Frame, tools: RunTools) -> None:
     """Compare a step with what players make of its packet, and log the numbers that follow from it."""
     kind = step.packet.kind.name.lower()
     if step.packet.frame != frame.index or kind != step.status:
         raise _fault(
-            method,
             tools,
             f"expected a packet of frame {frame.index} of the kind it says, {step.status!r}; got {kind!r} of frame "
             f"{step.packet.frame}",
@@ -135,7 +131,6 @@ def _check_step(
         difference = difference_between(player, step.state.player)
         if difference:
             raise _fault(
-                method,
                 tools,
                 f"its state is not what players have after its packet: {difference}. Go on from "
                 "decoder()(state.player, packet.data)",
@@ -143,7 +138,7 @@ def _check_step(
     log_packet(tools.log, player, step.packet)
 
 
-def _check_follow_up(method: StreamingMethod[Any], step: Step[Any], found: Step[Any], tools: RunTools) -> None:
+def _check_follow_up(step: Step[Any], found: Step[Any], tools: RunTools) -> None:
     difference = ""
     if found.packet.data != step.packet.data or found.status != step.status:
         difference = "packet or status"
@@ -151,13 +146,12 @@ def _check_follow_up(method: StreamingMethod[Any], step: Step[Any], found: Step[
         difference = difference_between(step.state.player, found.state.player)
     if difference:
         raise _fault(
-            method,
             tools,
             f"its follow_up changed what has been handed out: {difference}. Return dataclasses.replace(step, ...) "
             "with another state of the same player",
         )
 
 
-def _fault(method: StreamingMethod[Any], tools: RunTools, message: str) -> ComponentError:
+def _fault(tools: RunTools, message: str) -> ComponentError:
     tools.assembly.where.pause()  # the step is made: no iteration of it goes on
-    return fault(message, SLOT, method, tools.assembly.where)
+    return tools.assembly.use(SLOT).fault(message)

@@ -124,7 +124,7 @@ def with_growth(assembly: Assembly, state: StreamState, delta: Delta, work: Engi
         return delta  # the scene after the residual is not needed
     after = apply_delta(state.player.scene, delta)
     rows = assembly.growth.propose(after, work, rng)
-    with assembly.blame("growth"):
+    with assembly.use("growth").errors():
         if rows is not None:
             apply_delta(after, Delta((rows,)))  # before rows are left out: a wrong proposal gets an error
             rows = replace(rows, removed=rows.removed[~work.shell_rows.cpu().numpy()[rows.removed]])

@@ -11,7 +11,6 @@ from gsstream.core.changes.field import apply_field
 from gsstream.core.changes.motion import apply_motions, union_rows
 from gsstream.core.frame import Frame
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.assembly.guard import error_context
 from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.engine.state.stream_state import StreamState, updated
 from gsstream.engine.step.context import EngineContext
@@ -51,7 +50,7 @@ def propose_motion(
     motions = tuple(motion for motion in proposed if not motion.is_empty)
     if not motions:
         return Moved((), scene, work)
-    with error_context("motion", assembly.part("motion"), assembly.where):
+    with assembly.use("motion").errors():
         delta = Delta(motions)
         # What cannot be sent is refused before anything is learned on it.
         sections = encode_motions(delta.motions) + ([] if delta.field is None else encode_field(delta.field))

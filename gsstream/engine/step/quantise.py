@@ -12,7 +12,7 @@ import torch
 from gsstream.core.changes import Delta, Residual, sent_rows
 from gsstream.core.shapes import IntArray
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.assembly.checks import VARIABLE, Look
+from gsstream.engine.assembly.checks import VARIABLE
 from gsstream.engine.budget.trim import TrimmedDelta, trim_to_size
 from gsstream.engine.step.problem import Problem, Solution
 from gsstream.method.packets import delta_packet
@@ -60,13 +60,13 @@ def quantise_residual(assembly: Assembly, problem: Problem, solution: Solution) 
 
 def check_solution(assembly: Assembly, codes: Mapping[str, AttributeCode], solution: Solution) -> None:
     """Raise ComponentError unless what was learned can be sent: finite, and residuals within 32 bit symbols."""
-    look = Look(assembly.checks, "update", assembly.part("update"), assembly.where)
+    use = assembly.use("update")
     for name, value in solution.latents.items():
         most = codes[name].step * MAX_INT32_SYMBOL
         what = f"{name} after the last iteration ({VARIABLE}=step finds the first)"
-        look.values(what, value, limits=(-most, most), rows=solution.rows)
+        use.values(what, value, limits=(-most, most), rows=solution.rows)
     for name, value in solution.decoders.items():
-        look.values(f"decoder of {name}", value)
+        use.values(f"decoder of {name}", value)
 
 
 def gather_rows_or_zero(values: np.ndarray[Any, Any], known: IntArray, wanted: IntArray) -> np.ndarray[Any, Any]:

@@ -246,7 +246,7 @@ class _Record:
             self._form = _take(self._function(self._inputs), made)
         self._made = [value.detach() for value in made]
         if self._checks:
-            self._passed = torch.stack([ok for ok, *_ in self._checks])
+            self._passed = torch.stack([ok for ok, _ in self._checks])
             self.held.logical_and_(self._passed.all())
 
     def replay(self, leaves: list[torch.Tensor]) -> None:
@@ -274,9 +274,7 @@ class _Record:
     def _fail(self) -> None:
         self.held.fill_(True)
         failed = [place for place, ok in enumerate(self._passed.cpu().tolist()) if not ok]
-        _, error, blame = self._checks[failed[0] if failed else 0]
-        found = error()
-        raise blame(found) from found
+        raise self._checks[failed[0] if failed else 0][1]()
 
 
 def tensors_of(value: object) -> list[torch.Tensor]:

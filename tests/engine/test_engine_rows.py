@@ -14,7 +14,7 @@ from gsstream.engine.step.optimise import current_level, level_schedule
 from gsstream.packet import decode_packet, encode_delta, encode_key
 from gsstream.parts.backend.adam import ReferenceAdam
 from gsstream.parts.motion.none import Still
-from gsstream.parts.residual.row_parameters import RowParameters, TopologyEdit
+from gsstream.parts.residual.adam_state import RowParameters, TopologyEdit
 from gsstream.recipe.model import Stream
 from gsstream.testing.packet import tiny_key
 from tests.scenes import make_scene

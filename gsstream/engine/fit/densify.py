@@ -9,7 +9,7 @@ import torch
 from gsstream.core.gaussians import Gaussians
 from gsstream.engine.fit.constants import PRUNE_OPACITY
 from gsstream.parts.render.activations import activate_opacities, activate_scales, rotation_matrices
-from gsstream.parts.residual.row_parameters import TopologyEdit
+from gsstream.parts.residual.adam_state import TopologyEdit
 
 SPLIT_SHRINK = 1.6  # 3DGS: both halves of a split Gaussian are 1.6 times smaller
 SPLIT_SIZE = 0.01  # 3DGS: larger than this fraction of the extent is split, smaller is cloned

@@ -9,8 +9,7 @@ from gsstream.parts.backend.row_optimiser import RowOptimiser
 from gsstream.parts.gate.base import GateSampler
 from gsstream.parts.regularizer.base import Regularizer
 from gsstream.parts.render.backward import backward
-from gsstream.parts.residual.adam_state import AdamState
-from gsstream.parts.residual.row_parameters import RowParameters
+from gsstream.parts.residual.adam_state import AdamState, RowParameters
 
 
 class TrainedGates:

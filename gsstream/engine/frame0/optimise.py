@@ -36,7 +36,7 @@ from gsstream.input.seeds.shell import find_shell
 from gsstream.parts.render.activations import logit, rgb_to_sh0
 from gsstream.parts.render.exposure import Exposure
 from gsstream.parts.render.wrt import LossAndGrad, WrtScene
-from gsstream.parts.residual.row_parameters import RowParameters, TopologyEdit
+from gsstream.parts.residual.adam_state import RowParameters, TopologyEdit
 from gsstream.parts.structure.base import Anchors
 from gsstream.recipe.model import FirstFrame
 

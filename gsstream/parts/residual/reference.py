@@ -6,12 +6,11 @@ import torch
 
 from gsstream.core.gaussians import Gaussians
 from gsstream.parts.render.session import RenderSession
-from gsstream.parts.residual.adam_state import RowSteps
+from gsstream.parts.residual.adam_state import RowParameters, RowSteps
 from gsstream.parts.residual.decode import add_joint, decode_joint, join_features, joint_vjp
 from gsstream.parts.residual.layout import JointLayout
 from gsstream.parts.residual.optimiser import ResidualOptimiser
 from gsstream.parts.residual.rate import rate_gradient
-from gsstream.parts.residual.row_parameters import RowParameters
 
 
 class JointResidualOptimiser(ResidualOptimiser[RenderSession]):

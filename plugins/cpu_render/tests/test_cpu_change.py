@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from gsstream_cpu_render.change import CpuChange, _VoteCache
-from gsstream_cpu_render.changed_blocks import block_means, block_sigma, changed_blocks, difference_means
+from gsstream_cpu_render.change import CpuChange, _VoteCache, block_means, block_sigma, changed_blocks, difference_means
 from gsstream_cpu_render.renderer import CpuRenderer
 from hypothesis import given
 from hypothesis import strategies as st

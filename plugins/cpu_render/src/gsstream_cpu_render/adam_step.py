@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gsstream.backend import ADAM_BETAS, ADAM_EPS, AdamState
 from gsstream_cpu_render import _native
-from gsstream_cpu_render.checks import native_array, refuse, refuse_value
+from gsstream_cpu_render.arrays import native_array, refuse, refuse_value
 
 
 def step_table(

@@ -9,8 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from gsstream.api import ATTRIBUTES, Gaussians
 from gsstream.backend import RenderOutput
-from gsstream_cpu_render.arrays import SplatArrays
-from gsstream_cpu_render.checks import as_array
+from gsstream_cpu_render.arrays import as_array, splats_of
 from gsstream_cpu_render.pool import Passes
 
 
@@ -43,8 +42,3 @@ def differentiable(passes: Passes, gaussians: Gaussians[torch.Tensor], probe: to
     attributes = [value for _, value in gaussians.items()]
     image, alpha = _Rasterize.apply(passes, probe, *attributes)  # type: ignore[no-untyped-call]
     return RenderOutput(image, alpha)
-
-
-def splats_of(gaussians: Gaussians[torch.Tensor]) -> SplatArrays:
-    """Views of the tensors (copies only where a tensor is not contiguous)."""
-    return SplatArrays(*(as_array(name, value.contiguous()) for name, value in gaussians.items()))

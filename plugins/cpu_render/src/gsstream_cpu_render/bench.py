@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gsstream_cpu_render import _bench
-from gsstream_cpu_render.arrays import SplatArrays, new_gradients
-from gsstream_cpu_render.checks import Float32, refuse_value
+from gsstream_cpu_render.arrays import Float32, SplatArrays, new_gradients, refuse_value
 from gsstream_cpu_render.rasterizer import NumpyRasterizer
 from gsstream_cpu_render.threads import instruction_set as instruction_set
 from gsstream_cpu_render.threads import num_threads as num_threads

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gsstream_cpu_render.arrays import TOO_MANY_PAIRS, SplatArrays, mask_shape
-from gsstream_cpu_render.checks import Float32
+from gsstream_cpu_render.arrays import TOO_MANY_PAIRS, Float32, SplatArrays, mask_shape
 from gsstream_cpu_render.native import PAIR_BYTES, SPLAT_BYTES
 
 if TYPE_CHECKING:

@@ -12,9 +12,16 @@ from numpy.typing import NDArray
 from gsstream.api import Gaussians
 from gsstream.backend import LossAndGrad, ViewTarget
 from gsstream_cpu_render import _native
-from gsstream_cpu_render.arrays import SplatArrays, raise_on_faults, require_splats
-from gsstream_cpu_render.autograd import splats_of
-from gsstream_cpu_render.checks import Float32, as_array, lasting_array, refuse_value
+from gsstream_cpu_render.arrays import (
+    Float32,
+    SplatArrays,
+    as_array,
+    lasting_array,
+    raise_on_faults,
+    refuse_value,
+    require_splats,
+    splats_of,
+)
 from gsstream_cpu_render.loss import PreparedImage
 from gsstream_cpu_render.native import native_scene
 from gsstream_cpu_render.pool import PooledRasterizer

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsstream_cpu_render import _native
-from gsstream_cpu_render.checks import (
+from gsstream_cpu_render.arrays import (
     Float32,
     as_array,
     first_non_finite,

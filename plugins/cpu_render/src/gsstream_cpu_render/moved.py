@@ -10,7 +10,7 @@ import torch
 from gsstream.api import WrtTransforms
 from gsstream.backend import LossAndGrad, ViewTarget
 from gsstream_cpu_render import _native
-from gsstream_cpu_render.arrays import SplatArrays
+from gsstream_cpu_render.arrays import splats_of
 from gsstream_cpu_render.loss import weighted
 from gsstream_cpu_render.native import native_scene
 
@@ -25,8 +25,7 @@ def loss_and_grad_of_transforms(
     group = np.ascontiguousarray(transforms.group, np.int64)
     parts = transforms.center, transforms.translation, transforms.rotation
     arrays = [np.ascontiguousarray(part, np.float64) for part in parts]
-    splats = SplatArrays(*(np.ascontiguousarray(value.detach().numpy(), np.float32) for _, value in wrt.base.items()))
-    given = rasterizer, native_scene(splats), compared, group, *arrays, grad, curvature
+    given = rasterizer, native_scene(splats_of(wrt.base)), compared, group, *arrays, grad, curvature
     faults, l1, dssim = _native.transform_loss_and_grad(*given)
     values = target.prepared.image.size
     loss = weighted(l1, dssim, target.dssim, 1.0 / values)

@@ -10,15 +10,17 @@ from numpy.typing import ArrayLike
 
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.arrays import (
+    Float32,
     SplatArrays,
     SplatGradients,
     gradient_shapes,
     new_gradients,
     raise_on_faults,
+    refuse,
+    refuse_value,
     require_float32,
     require_splats,
 )
-from gsstream_cpu_render.checks import Float32, refuse, refuse_value
 from gsstream_cpu_render.loss import PreparedImage, weighted
 from gsstream_cpu_render.view import NEAR, Background, checked_view
 

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsstream_cpu_render import _native
-from gsstream_cpu_render.arrays import SplatArrays
-from gsstream_cpu_render.checks import Float32
+from gsstream_cpu_render.arrays import Float32, SplatArrays
 from gsstream_cpu_render.rasterizer import NumpyRasterizer
 from gsstream_cpu_render.view import Background
 

@@ -15,14 +15,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from gsstream_cpu_render.arrays import (
     MASK_TILE,
+    Float32,
     SplatArrays,
     SplatGradients,
+    native_array,
     raise_on_faults,
+    refuse,
     require_mask,
     require_splats,
 )
 from gsstream_cpu_render.by_parts import draw_by_parts
-from gsstream_cpu_render.checks import Float32, native_array, refuse
 from gsstream_cpu_render.native import NativeRasterizer, native_scene
 from gsstream_cpu_render.view import NEAR, Background
 

@@ -11,8 +11,7 @@ from gsstream.api import ATTRIBUTES, AnalyticGate, AnalyticPenalty, Gaussians
 from gsstream.backend import ADAM_BETAS, ADAM_EPS, AdamState, JointLayout, ResidualEpoch, ResidualOptimiser
 from gsstream_cpu_render import _native
 from gsstream_cpu_render.adam_step import step_table
-from gsstream_cpu_render.autograd import splats_of
-from gsstream_cpu_render.checks import refuse
+from gsstream_cpu_render.arrays import refuse, splats_of
 from gsstream_cpu_render.native import native_scene
 from gsstream_cpu_render.session import CpuSession
 
@@ -99,8 +98,9 @@ class CpuResidualOptimiser(ResidualOptimiser[CpuSession]):
                 made = self._native_run(epoch, gate, penalty)
             case _:
                 pass
-        left = epoch.after(len(made)) if made else epoch
-        return made + super().run(left) if left.iterations else made
+        if len(made) == len(epoch.iterations):
+            return made
+        return made + super().run(epoch.after(len(made)))
 
     def _native_run(
         self, epoch: ResidualEpoch[CpuSession], gate: AnalyticGate, penalty: AnalyticPenalty
@@ -155,8 +155,7 @@ class CpuResidualOptimiser(ResidualOptimiser[CpuSession]):
     def select_rows(self, rows: torch.Tensor) -> None:
         self._base, self._units = self._base.rows(rows), self._units[rows]
         self._latents = self._latents.detach()[rows].requires_grad_()
-        state = self._states["latents"]
-        self._states["latents"] = AdamState(state.exp_avg[rows], state.exp_avg_sq[rows], state.steps[rows])
+        self._states["latents"] = self._states["latents"].rows(rows)
         self._pending = None
 
 

@@ -25,10 +25,9 @@ from gsstream.backend import (
     check_tiles,
 )
 from gsstream_cpu_render import _native
-from gsstream_cpu_render.arrays import SplatArrays
-from gsstream_cpu_render.autograd import differentiable, splats_of
+from gsstream_cpu_render.arrays import Float32, SplatArrays, as_array, splats_of
+from gsstream_cpu_render.autograd import differentiable
 from gsstream_cpu_render.cached_view import CachedView, Ids, freeze_views, update_views
-from gsstream_cpu_render.checks import Float32, as_array
 from gsstream_cpu_render.moved import loss_and_grad_of_transforms
 from gsstream_cpu_render.pool import Passes, PooledRasterizer, acquire_rasterizer
 from gsstream_cpu_render.view import Background

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gsstream_cpu_render import _native
-from gsstream_cpu_render.checks import refuse_value
+from gsstream_cpu_render.arrays import refuse_value
 
 
 def num_threads() -> int:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gsstream_cpu_render.checks import Float32, refuse, refuse_value
+from gsstream_cpu_render.arrays import Float32, refuse, refuse_value
 
 Background = tuple[float, float, float]
 NEAR = 0.01

@@ -7,7 +7,7 @@ import torch
 
 from gsstream.api import Gaussians
 from gsstream.backend import LossAndGrad, ViewTarget, WrtScene
-from gsstream_cpu_render.autograd import splats_of
+from gsstream_cpu_render.arrays import splats_of
 from gsstream_cpu_render.cached_view import exposure_arrays
 from gsstream_cpu_render.pool import PooledRasterizer
 

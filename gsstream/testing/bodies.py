@@ -12,7 +12,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.log import FrameLog
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
-from gsstream.engine.fit.frame_images import FrameImages
+from gsstream.engine.fit.photometric import FrameImages
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.context import EngineContext
 from gsstream.packet import PlayerState

@@ -13,7 +13,7 @@ from gsstream.core.changes import Scene
 from gsstream.core.log import FrameLog
 from gsstream.core.part import Part
 from gsstream.core.rng import Rng
-from gsstream.engine.fit.frame_images import FrameImages
+from gsstream.engine.fit.photometric import FrameImages
 from gsstream.engine.run.encoder import EncodedFrame
 from gsstream.engine.step.context import EngineContext
 from gsstream.input.recordings.open import open_source

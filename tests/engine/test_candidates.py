@@ -10,13 +10,19 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import Field
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.engine.step.candidates import candidates, keep_mask
+from gsstream.core.part import PartConfig
+from gsstream.engine.fit.gates import TrainedGates
+from gsstream.engine.step.frame_step import candidates
+from gsstream.parts.backend.adam import ReferenceAdam
 from gsstream.parts.backend.base import ScatterSession
 from gsstream.parts.backend.change import Change
 from gsstream.parts.backend.reference import ReferenceRenderer
+from gsstream.parts.gate.base import GateSampler
+from gsstream.parts.regularizer.none import NoRegularizer
 from gsstream.parts.render.images import TILE
 from gsstream.parts.render.session import RenderSession
 from gsstream.testing.cases import BLACK, scene
@@ -130,17 +136,56 @@ def test_candidates_changed_and_have_a_gate_that_may_open(nodes: int, rows: int,
     assert found.dtype == torch.int64
 
 
+class AsGiven(GateSampler):
+    """A gate is its logit."""
+
+    source = "test"
+
+    class Config(PartConfig):
+        levels: int = Field(description="levels of a gate")
+
+    @property
+    def num_levels(self) -> int:
+        return self.config.levels
+
+    def init(self, logits: torch.Tensor) -> torch.Tensor:
+        return logits
+
+    def noise(self, num_nodes: int, generator: torch.Generator) -> None:
+        return None
+
+    def sample(self, logits: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
+        return logits
+
+    def open_probability(self, logits: torch.Tensor) -> torch.Tensor:
+        return logits
+
+    def bound(self, logits: torch.Tensor) -> torch.Tensor:
+        return logits
+
+
 @given(nodes=st.integers(1, 6), rows=st.integers(0, 20), seed=st.integers(0, 999), levels=st.sampled_from([1, 10, 255]))
-def test_rows_leave_when_their_gate_rounds_to_closed(nodes: int, rows: int, seed: int, levels: int) -> None:
+def test_a_gate_that_rounds_to_closed_is_closed_for_its_rows(nodes: int, rows: int, seed: int, levels: int) -> None:
+    """Before and after some of the rows leave."""
     rng = np.random.default_rng(seed)
     node_of = rng.integers(0, nodes, rows)
-    gates = rng.choice([0.0, 0.4 / levels, 0.6 / levels, 1.0], nodes)
-    waiting = rng.random(rows) < 0.3
-    hierarchy = flat(node_of, nodes)
-    stays = [round(gates[node] * levels) > 0 for node in node_of]
-    assert keep_mask(torch.from_numpy(gates), levels, hierarchy, None).tolist() == stays
-    found = keep_mask(torch.from_numpy(gates), levels, hierarchy, torch.from_numpy(waiting))
-    assert found.tolist() == [bool(a or b) for a, b in zip(stays, waiting, strict=True)]
+    values = rng.choice([0.0, 0.4 / levels, 0.6 / levels, 1.0], nodes)
+    opened = np.array([round(values[node] * levels) > 0 for node in node_of], bool)
+    gates = TrainedGates(
+        gate=AsGiven(AsGiven.Config(levels=levels)),
+        regularizer=NoRegularizer(),
+        optimiser=ReferenceAdam(),
+        lr=0.1,
+        logits=torch.from_numpy(values),
+        hierarchy=flat(node_of, nodes),
+        rows=torch.arange(rows),
+        generator=torch.Generator(),
+    )
+    assert gates.opened()[gates.node_of].tolist() == opened.tolist()
+    some = np.flatnonzero(rng.random(rows) < 0.5)
+    gates.select_rows(torch.from_numpy(some))
+    assert gates.opened()[gates.node_of].tolist() == opened[some].tolist()
+    assert gates.all_logits().tolist() == values.tolist()
 
 
 def flat(node_of: Any, nodes: int) -> Hierarchy:

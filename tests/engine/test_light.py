@@ -8,7 +8,7 @@ import torch
 
 from gsstream.core.changes import Delta, Layout, Residual, Scene, apply_delta, sent_rows
 from gsstream.core.gaussians import SH0
-from gsstream.engine.fit.frame_images import FrameImages
+from gsstream.engine.fit.photometric import FrameImages
 from gsstream.engine.state.drift import Drift, Lit, drift, looked_at, tile_shares
 from gsstream.engine.step.light import camera_offsets
 from gsstream.engine.step.light_symbols import STEP, light_symbols, with_light

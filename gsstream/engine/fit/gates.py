@@ -9,7 +9,7 @@ from gsstream.parts.backend.row_optimiser import RowOptimiser
 from gsstream.parts.gate.base import GateSampler
 from gsstream.parts.regularizer.base import Regularizer
 from gsstream.parts.render.backward import backward
-from gsstream.parts.residual.adam_state import AdamState, RowParameters
+from gsstream.parts.residual.adam_state import AdamState
 
 
 class TrainedGates:
@@ -26,20 +26,13 @@ class TrainedGates:
         rows: torch.Tensor,
         generator: torch.Generator,
     ) -> None:
-        self.gate, self.regularizer, self.lr = gate, regularizer, lr
+        self.gate, self.regularizer, self._optimiser, self.lr = gate, regularizer, optimiser, lr
         self.num_gaussians, self._generator, self._all = hierarchy.num_gaussians, generator, logits
         self._nodes, node_of = torch.unique(hierarchy.node_of[rows], return_inverse=True)
         self.hierarchy = _roots(node_of, len(self._nodes))
-        self._table = RowParameters({"logits": logits[self._nodes]}, {"logits": lr}, optimiser)
+        self.logits = logits.detach()[self._nodes].requires_grad_()
+        self.state = AdamState.start(self.logits)
         self._ahead: list[torch.Tensor | None] = []
-
-    @property
-    def logits(self) -> torch.Tensor:
-        return self._table["logits"]
-
-    @property
-    def state(self) -> AdamState:
-        return self._table.state("logits")
 
     @property
     def node_of(self) -> torch.Tensor:
@@ -76,19 +69,21 @@ class TrainedGates:
         if not trained:
             return
         backward(*zip(*trained, strict=True))
-        self._table.step()
+        gradient, self.logits.grad = self.logits.grad, None
+        if gradient is not None:
+            self._optimiser.step({"": self.logits}, {"": gradient}, {"": self.state}, {"": self.lr})
         self.logits.data.copy_(self.gate.bound(self.logits.detach()))
 
-    def final(self) -> torch.Tensor:
-        """Return the gates [M] as they would be sent now."""
-        return self.gate.sample(self.logits.detach(), None)
+    def opened(self) -> torch.Tensor:
+        """Return [M] bool: gates that would be sent open now."""
+        return torch.round(self.gate.sample(self.logits.detach(), None) * self.gate.num_levels) > 0
 
     def select_rows(self, rows: torch.Tensor) -> None:
         """Go on with these rows [K] of the candidates, and with the gates that they have."""
         self._all = self.all_logits()
         nodes, node_of = torch.unique(self.node_of[rows], return_inverse=True)
         self._nodes, self.hierarchy = self._nodes[nodes], _roots(node_of, len(nodes))
-        self._table.select_rows(nodes)
+        self.logits, self.state = self.logits.detach()[nodes].requires_grad_(), self.state.rows(nodes)
 
     def all_logits(self) -> torch.Tensor:
         """Return the logits of all gates of the scene, with the current values of those that are trained."""

@@ -1,4 +1,7 @@
-"""What renders of one frame are compared with: the images, by the run's loss, in the colours of each camera."""
+"""The images of a frame where they are worked on, and what renders are compared with.
+
+Renders are compared by the run's loss, in the colours of each camera.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,35 @@ import torch
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import Gaussians
-from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.parts.backend.base import Renderer
 from gsstream.parts.render.exposure import Exposure
+from gsstream.parts.render.images import float_image
 from gsstream.parts.render.loss import Loss
 from gsstream.parts.render.target import ViewTarget
+
+
+class FrameImages:
+    """The images [H, W, 3] of one frame on a device, copied as they are stored when first asked for."""
+
+    def __init__(self, images: Any, device: torch.device) -> None:
+        self._images, self.device = images, device
+        self._there: dict[int, torch.Tensor] = {}
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def stored(self, view: int) -> torch.Tensor:
+        """Return [H, W, 3] as it is stored: float32, or uint8 of which 255 is 1.0."""
+        if view not in self._there:
+            self._there[view] = torch.from_numpy(self._images[view]).to(self.device)
+        return self._there[view]
+
+    def __getitem__(self, view: int) -> torch.Tensor:
+        return float_image(self.stored(view))
+
+    def all_stored(self) -> list[torch.Tensor]:
+        """Return the images of all views as they are stored."""
+        return [self.stored(view) for view in range(len(self))]
 
 
 class PhotometricLoss:

@@ -23,9 +23,8 @@ from gsstream.engine.assembly.checks import VARIABLE, Checks, PartInUse
 from gsstream.engine.fit import constants
 from gsstream.engine.fit.densify import DensifyStatistics, GrowthLimits, grow_and_prune
 from gsstream.engine.fit.exposure import ExposureFit
-from gsstream.engine.fit.frame_images import FrameImages
 from gsstream.engine.fit.nearest import neighbour_distance
-from gsstream.engine.fit.photometric import PhotometricLoss
+from gsstream.engine.fit.photometric import FrameImages, PhotometricLoss
 from gsstream.engine.frame0.hutchinson import TrainingViews
 from gsstream.engine.frame0.penalties import add_penalty_grad
 from gsstream.engine.frame0.prune import prune_by_error

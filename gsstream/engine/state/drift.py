@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import torch
 
-from gsstream.engine.fit.frame_images import FrameImages
+from gsstream.engine.fit.photometric import FrameImages
 from gsstream.parts.render.images import TILE
 
 #: Every so many frames the pictures are looked at, and of these every so many pixels each way, in two grids.

@@ -16,7 +16,7 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.engine.fit.densify import DensifyStatistics
-from gsstream.engine.fit.frame_images import FrameImages
+from gsstream.engine.fit.photometric import FrameImages
 from gsstream.engine.state.drift import Lit
 from gsstream.input.seeds.shell import Shell
 from gsstream.method.base import Step as MethodStep

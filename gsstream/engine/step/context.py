@@ -7,17 +7,14 @@ from typing import Literal
 
 import torch
 
-from gsstream.core.cameras import Cameras
 from gsstream.core.context import RowGradient, ScreenGradient
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.log import FrameLog
 from gsstream.core.picture_size import far_weight
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.constants import DSSIM
-from gsstream.engine.fit.frame_images import FrameImages
-from gsstream.engine.fit.photometric import PhotometricLoss, render_exposed
+from gsstream.engine.fit.photometric import FrameImages, PhotometricLoss, render_exposed
 from gsstream.engine.state.stream_state import Resident, StreamState
 from gsstream.input.seeds.shell import in_shell
 from gsstream.metrics.noise import noise_sigma
@@ -53,10 +50,11 @@ class EngineContext:
         if resident is None:
             gaussians = state.gaussians.map(lambda value: value.to(device))
             resident = Resident(gaussians, state.hierarchy.to(device), state.shown(device))
-        self._gaussians, self._hierarchy, self.previous_images = resident
+        self.gaussians, self.hierarchy, self.previous_images = resident
+        self.index, self.cameras = frame.index, frame.cameras
         self._device, self._frame, self._change = device, frame, change
         self._previous, self._shell = state.previous, state.shell
-        self._static = [] if change is None else [count == 0 for count in change.per_view]
+        self._static = set() if change is None else {view for view, count in enumerate(change.per_view) if not count}
         self._background, self._part_scale = assembly.background, part_scale
         self.log = log
         self.key_rows = state.player.key_rows
@@ -69,31 +67,15 @@ class EngineContext:
     def session(self) -> RenderSession:
         """The render session of this scene, with what the last frame or a part has projected already."""
         if self._session is None:
-            self._session = self._assembly.renderer.open(self._gaussians, None, self.cameras, self._background)
+            self._session = self._assembly.renderer.open(self.gaussians, None, self.cameras, self._background)
         return self._session
 
     def session_for(self, rows: torch.Tensor) -> RenderSession:
         """Return the session in which only ``rows`` change; a new one when all do, since no cache is of use then."""
-        if len(rows) == len(self._gaussians):
-            return self._assembly.renderer.open(self._gaussians, None, self.cameras, self._background)
+        if len(rows) == len(self.gaussians):
+            return self._assembly.renderer.open(self.gaussians, None, self.cameras, self._background)
         self.session.narrow(rows)
         return self.session
-
-    @property
-    def index(self) -> int:
-        return self._frame.index
-
-    @property
-    def gaussians(self) -> Gaussians[torch.Tensor]:
-        return self._gaussians
-
-    @property
-    def hierarchy(self) -> Hierarchy:
-        return self._hierarchy
-
-    @property
-    def cameras(self) -> Cameras:
-        return self._frame.cameras
 
     def image(self, view: int) -> torch.Tensor:
         return self.images[view]
@@ -107,7 +89,7 @@ class EngineContext:
         return self._change.difference(view, self.images.stored(view), self.previous_images.stored(view))
 
     def previous_render(self, view: int) -> torch.Tensor:
-        return self.shown(self._gaussians, view)
+        return self.shown(self.gaussians, view)
 
     def shown(self, gaussians: Gaussians[torch.Tensor], view: int) -> torch.Tensor:
         renderer, exposure = self._assembly.renderer, self.photometric.exposure
@@ -116,19 +98,16 @@ class EngineContext:
         )
 
     def screen_gradient(self, view: int, image_gradient: torch.Tensor) -> ScreenGradient:
-        if self._is_static(view):
-            none = torch.zeros_like(self._gaussians.means[:, :2])
+        if view in self._static:
+            none = torch.zeros_like(self.gaussians.means[:, :2])
             return ScreenGradient(none, torch.zeros_like(none[:, 0], dtype=torch.bool))
         return self.session.screen_gradient(view, self._upstream(view, image_gradient))
 
     def screen_gradient_rows(self, view: int, image_gradient: torch.Tensor) -> RowGradient:
-        if self._is_static(view):
-            means = self._gaussians.means
+        if view in self._static:
+            means = self.gaussians.means
             return RowGradient(means.new_zeros(0, dtype=torch.int64), means.new_zeros(0, 2))
         return self.session.screen_gradient_rows(view, self._upstream(view, image_gradient))
-
-    def _is_static(self, view: int) -> bool:
-        return self._change is not None and self._static[view]
 
     def _upstream(self, view: int, image_gradient: torch.Tensor) -> torch.Tensor:
         """A gradient by what a camera records, in the tiles that changed, as one by the scene's colours."""
@@ -154,14 +133,14 @@ class EngineContext:
     @property
     def shell_rows(self) -> torch.Tensor:
         if self._shell is None:
-            return torch.zeros_like(self._gaussians.opacities, dtype=torch.bool)
-        means, scales = self._gaussians.means.cpu().numpy(), self._gaussians.scales.cpu().numpy()
+            return torch.zeros_like(self.gaussians.opacities, dtype=torch.bool)
+        means, scales = self.gaussians.means.cpu().numpy(), self.gaussians.scales.cpu().numpy()
         return torch.from_numpy(in_shell(means, scales, self._shell)).to(self._device)
 
     def changed_rows(self, min_votes: float) -> torch.Tensor:
         if self._change is None:
             return ~self.shell_rows
-        return self._change.rows(self._gaussians.means, self.cameras, self.session, min_votes) & ~self.shell_rows
+        return self._change.rows(self.gaussians.means, self.cameras, self.session, min_votes) & ~self.shell_rows
 
     def narrow(self, rows: torch.Tensor) -> None:
         self._session = self.session_for(rows)
@@ -193,7 +172,7 @@ class EngineContext:
     def on(self, gaussians: Gaussians[torch.Tensor], session: RenderSession | None = None) -> EngineContext:
         # The loss of the same images and the votes that were counted are shared, not made again.
         other = copy(self)
-        other._gaussians, other._session = gaussians.map(lambda value: value.to(self._device)), session
+        other.gaussians, other._session = gaussians.map(lambda value: value.to(self._device)), session
         return other
 
     def everywhere(self) -> EngineContext:

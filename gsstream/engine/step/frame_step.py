@@ -20,10 +20,9 @@ from gsstream.core.storage import packed
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.budget.epoch_scheduler import EpochScheduler
-from gsstream.engine.fit.frame_images import FrameImages
+from gsstream.engine.fit.photometric import FrameImages
 from gsstream.engine.state.drift import INTERVAL
 from gsstream.engine.state.stream_state import Resident, Step, StreamState, next_state, updated
-from gsstream.engine.step.candidates import CHANGE_VOTES, candidates
 from gsstream.engine.step.context import EngineContext
 from gsstream.engine.step.light import Sent, light_drift, relit
 from gsstream.engine.step.metrics import step_numbers
@@ -131,6 +130,12 @@ def with_growth(assembly: Assembly, state: StreamState, delta: Delta, work: Engi
     return delta.with_row_edit(rows)
 
 
+#: Least share of the views a Gaussian projects into in which it must lie in or beside changed tiles. The vote keeps
+#: many cameras from making everything a candidate: a wall is behind a moving person in some view, but only what moves
+#: lies in changed tiles in most of them (the idea of a visual hull).
+CHANGE_VOTES = 0.75
+
+
 class Selected(NamedTuple):
     """Rows [A] int64, ascending, that take part, and logits [M] of the gates."""
 
@@ -138,8 +143,20 @@ class Selected(NamedTuple):
     logits: torch.Tensor
 
 
+def candidates(
+    changed: torch.Tensor, open_probability: torch.Tensor, hierarchy: Hierarchy, threshold: float
+) -> torch.Tensor:
+    """Return the rows [A] int64, ascending, that changed and whose gate may open."""
+    return ((open_probability > threshold)[hierarchy.node_of] & changed).nonzero()[:, 0]
+
+
 def select(assembly: Assembly, work: EngineContext, hierarchy: Hierarchy, scope: Scope) -> Selected:
-    """Return what confidence, propagation and gate choose; none of them is called in a frame without a residual."""
+    """Return what confidence, propagation and gate choose; none of them is called in a frame without a residual.
+
+    A Gaussian takes part when it is seen in a changed tile of some training view, when its centre lies in or beside
+    changed tiles in enough of the views that it projects into, and when its gate may open. Everything else is frozen:
+    it is neither projected nor optimised nor sent.
+    """
     if scope is Scope.NONE:
         nothing = work.gaussians.means.new_zeros(0, dtype=torch.int64)
         return Selected(nothing, work.gaussians.means.new_zeros(hierarchy.num_nodes))

@@ -22,7 +22,7 @@ from gsstream.core.frame import Frame
 from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.fit.frame_images import FrameImages
+from gsstream.engine.fit.photometric import FrameImages
 from gsstream.engine.state.drift import INTERVAL, Drift, Lit, drift, looked_at
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.context import EngineContext

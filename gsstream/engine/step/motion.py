@@ -11,7 +11,7 @@ from gsstream.core.changes.field import apply_field
 from gsstream.core.changes.motion import apply_motions, union_rows
 from gsstream.core.frame import Frame
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.fit.frame_images import FrameImages
+from gsstream.engine.fit.photometric import FrameImages
 from gsstream.engine.state.stream_state import StreamState, updated
 from gsstream.engine.step.context import EngineContext
 from gsstream.method.tools import Tools

@@ -32,7 +32,6 @@ from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.budget.epoch_scheduler import EpochScheduler, estimated_bytes
 from gsstream.engine.fit.constants import GATE_LR
 from gsstream.engine.fit.gates import TrainedGates
-from gsstream.engine.step.candidates import keep_mask
 from gsstream.engine.step.problem import Problem, Solution
 from gsstream.parts.gate.base import GateSampler
 from gsstream.parts.residual.layout import joint_layout
@@ -105,9 +104,10 @@ class _Fit:
 
     def end_pass(self) -> None:
         """Let go of rows whose gate has closed, but where the recipe lets everything take part; weigh the bytes."""
-        self.open_gates.append(int(self.opened().sum()))
+        opened = self.gates.opened()
+        self.open_gates.append(int(opened.sum()))
         if self.schedule.budget.change_threshold > 0 and self.schedule.goes_on:
-            self.release(self.schedule.done / self.schedule.epochs)
+            self.release(opened, self.frozen(self.schedule.done / self.schedule.epochs))
         if self.schedule.sized and len(self.rows):
             self.schedule.weigh_bytes(self.estimated_bytes())
 
@@ -115,9 +115,12 @@ class _Fit:
         """[A] bool: rows whose level is not trained yet at this share of the frame; None: all take part."""
         return self.levels > current_level(self.stages, fraction) if self.stages else None
 
-    def release(self, fraction: float) -> None:
-        """Let go of the rows whose gate has closed: they no longer cost anything in this frame."""
-        keep = keep_mask(self.gates.final(), self.assembly.gate.num_levels, self.gates.hierarchy, self.frozen(fraction))
+    def release(self, opened: torch.Tensor, frozen: torch.Tensor | None) -> None:
+        """Let go of the rows whose gate has closed: they no longer cost anything in this frame.
+
+        A closed gate draws its rows as they were, so nothing that is seen changes.
+        """
+        keep = opened[self.gates.node_of] if frozen is None else opened[self.gates.node_of] | frozen
         if int(keep.sum()) > MAX_RETAINED_SHARE * len(keep):
             return
         rows = keep.nonzero()[:, 0]
@@ -126,13 +129,9 @@ class _Fit:
         self.rows, self.levels = self.rows[rows], self.levels[rows]
         self.problem.session.narrow(self.rows)
 
-    def opened(self) -> torch.Tensor:
-        """[M] bool: gates that would be sent open if this epoch were the last."""
-        return torch.round(self.gates.final() * self.assembly.gate.num_levels) > 0
-
     def estimated_bytes(self) -> float:
         """Bytes of a packet if this epoch were the last: symbols behind open gates, and the gates."""
-        opened = self.opened()
+        opened = self.gates.opened()
         latents = self.residual.latents.detach()[opened[self.gates.node_of]]
         return estimated_bytes(torch.round(latents / self.code.steps)) + float(opened.sum())
 

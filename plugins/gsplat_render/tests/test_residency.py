@@ -211,7 +211,7 @@ def test_where_little_changes_the_scene_stays_there_and_only_what_changed_crosse
         assert step.state.resident is not None
         crossed = log.up - before
         assert not [line for line in crossed if "step/context.py" in line or "core/hierarchy.py" in line], crossed
-        assert sum(n for line, n in crossed.items() if "frame_images.py" in line) == len(frames[0].cameras)
+        assert sum(n for line, n in crossed.items() if "photometric.py" in line) == len(frames[0].cameras)
         scene = step.state.resident.gaussians.map(torch.Tensor.cpu)
     for (name, value), (_, want) in zip(scene.items(), step.state.player.gaussians.items(), strict=True):
         assert torch.equal(value, torch.from_numpy(want)), name

@@ -18,6 +18,7 @@ from gsstream.core.errors import InputError, OutputError
 from gsstream.core.install_hints import install_extra
 from gsstream.core.memory import limited_memory
 from gsstream.core.shapes import FloatArray
+from gsstream.packet import StreamMeta
 from gsstream.player.camera_file import read_path
 from gsstream.player.interpolation import Moments, frame_times
 from gsstream.player.paths import PATHS, camera_path, joined, resized
@@ -66,11 +67,11 @@ def play(
             playback.entry(frame)
         rate = playback.meta.fps if fps is None else fps
         times = frame_times(chosen, playback.meta.fps, rate) if fps is not None else [float(frame) for frame in chosen]
-        cameras = choose_cameras(playback, camera, len(times))
+        cameras, recorded = choose_cameras(playback, camera, len(times)), _recorded_focal(playback.meta, camera)
         cameras = cameras if size is None else resized(cameras, *size)
         kept = len(times) if Path(out).suffix.lower() in _ANIMATED else 1
         playback.limit.check_pictures(cameras.width, cameras.height, kept)
-        images = _images(playback, times, cameras, renderer=renderer, progress=progress)
+        images = _images(playback, times, cameras, recorded, renderer=renderer, progress=progress)
         try:
             played = write_pictures(Path(out), images, chosen if fps is None else range(len(times)), rate)
         except OSError as error:
@@ -112,10 +113,22 @@ def choose_cameras(playback: Playback, camera: str | None, number: int) -> Camer
     return meta.camera((*meta.test.ids, *meta.train.ids)[0] if camera is None else camera)
 
 
+def _recorded_focal(meta: StreamMeta, camera: str | None) -> float:
+    """Focal length, in pixels of the recording, of the camera that ``choose_cameras`` takes intrinsics from."""
+    rig = (meta.test, meta.train)
+    ids = [name for cameras in rig for name in cameras.ids]
+    if camera in ids:
+        return float(meta.camera(camera).Ks[0, 0, 0])
+    used = [cameras for cameras in rig if len(cameras)][-1 if camera in PATHS else 0]
+    return float(used.Ks[0, 0, 0])
+
+
 def _images(
     playback: Playback,
     times: Sequence[float],
     cameras: Cameras,
+    recorded: float,
+    *,
     renderer: PlayerRenderer | None,
     progress: Callable[[int, int], None] | None,
 ) -> Iterator[Bytes]:
@@ -125,7 +138,8 @@ def _images(
         scene, view = scenes.at(time), min(i, len(cameras) - 1)
         # An empty packet keeps the very same scene object: nothing has to be rendered again.
         if last is None or last[0] is not scene or last[1] != view:
-            last = (scene, view, render(scene, cameras, view, background=background, renderer=renderer))
+            scale = float(cameras.Ks[view, 0, 0]) / recorded
+            last = (scene, view, render(scene, cameras, view, background=background, renderer=renderer, scale=scale))
         yield to_bytes(last[2])
         if progress is not None:
             progress(i + 1, len(times))

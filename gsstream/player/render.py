@@ -27,6 +27,7 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.install_hints import install_renderer
 from gsstream.core.memory import VARIABLE, memory_limit, require_memory
 from gsstream.core.shapes import FloatArray, check_finite, check_shape
+from gsstream.player.blur import enlarged
 from gsstream.player.software import render_numpy
 
 ENTRY_POINT_GROUP = "gsstream.player"
@@ -98,6 +99,7 @@ def render(
     view: int = 0,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     renderer: PlayerRenderer | None = None,
+    scale: float = 1.0,
 ) -> FloatArray:
     """Render one camera of a rig: [H, W, 3] float32, not clamped above 1.
 
@@ -107,6 +109,7 @@ def render(
         view: index of one of them.
         background: colour behind everything, 0 to 1.
         renderer: that draws; None: the fastest that loads.
+        scale: pixels of the picture for one of the recorded; above 1 it is as smooth as the recorded one, enlarged.
 
     Raises ShapeError when the renderer returns another shape or a value that is not finite, InputError when the picture
     would take more memory than :func:`gsstream.core.memory.memory_limit` allows.
@@ -114,9 +117,9 @@ def render(
     chosen = find_renderer() if renderer is None else renderer
     size = (cameras.width, cameras.height)
     pose = (cameras.viewmats[view], cameras.Ks[view])
-    arrays = [array for _, array in gaussians.items()]
     what = f"drawing {len(gaussians)} Gaussians on {cameras.width} x {cameras.height} pixels"
     require_memory(cameras.width * cameras.height * PER_PIXEL, what)
+    arrays = [array for _, array in enlarged(gaussians, *pose, scale).items()]
     limit = {"max_memory": memory_limit()} if _takes_limit(chosen.render_numpy) else {}
     try:
         image = chosen.render_numpy(arrays, *pose, *size, background, near=cameras.near_plane, **limit)

@@ -97,6 +97,14 @@ export function parsePacket(data, offset) {
   return { header, sections: splitSections(header.sections, body, offset + PACKET_HEADER) };
 }
 
+/** The numbers of the sections of a packet, as far as they can be told before it is checked. */
+export function* sectionsOf(data) {
+  const view = viewOf(data);
+  for (let at = PACKET_HEADER; at + SECTION_HEADER <= data.length; at += SECTION_HEADER + view.getUint32(at + 1, true)) {
+    yield data[at];
+  }
+}
+
 /** The `number` sections of `body` in file order, name -> `{ data, offset }`; `start`: its place in the file. */
 export function splitSections(number, body, start) {
   const view = viewOf(body);

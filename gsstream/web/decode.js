@@ -1,13 +1,12 @@
 // The state that a stream of packets leads to, bit for bit the one of the encoder. See docs/spec.
 
-import { decodeField, SECTIONS as FIELD } from "./changes/field.js";
 import { copied as motionCopy, decodeMotions, unionRows, SECTIONS as MOTION } from "./changes/motion.js";
 import { applyResidual, decodeResidual, SECTIONS as RESIDUAL } from "./changes/residual.js";
 import { applyRows, decodeRows, SECTIONS as ROWS } from "./changes/rows.js";
 import { KIND, parsePacket } from "./container.js";
 import { PacketError, located } from "./errors.js";
 import { displacementBetween, gatherDisplacement, gatherGroups, gatherValues } from "./history.js";
-import { decodeKey } from "./key.js";
+import { decodeKey, later } from "./key.js";
 
 /**
  * The state after one complete packet at byte `offset` of its file.
@@ -51,7 +50,7 @@ export function firstState(frame, number, { scene, layout, meta, rest }) {
 }
 
 /** Sections of a delta packet in their order. */
-const ORDER = [...MOTION, ...FIELD, ...RESIDUAL, ...ROWS];
+const ORDER = [...MOTION, "field", ...RESIDUAL, ...ROWS];
 
 function decodeDelta(found, state, offset) {
   const { field, motion } = found;
@@ -63,7 +62,7 @@ function decodeDelta(found, state, offset) {
   let motions = motion ? located(motion.offset, () => decodeMotions(motion, state)) : null;
   if (field) {
     motions ??= { ...motionCopy(state), groups: state.groups, rows: [] };
-    motions = located(field.offset, () => decodeField(field, motions));
+    motions = located(field.offset, () => later.field(field, motions));
   }
   const stray = names.find((name) => RESIDUAL.includes(name));
   if (stray && !found.gates) throw new PacketError(`delta packet: section ${stray} without gates`, found[stray].offset);

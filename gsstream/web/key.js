@@ -11,8 +11,8 @@ import { parseMeta } from "./meta.js";
 import { decodeSymbols, within } from "./symbols.js";
 import { decompress } from "./vendor/fzstd.js";
 
-/** `layers` decodes packets with layers, once who meets one has loaded layers.js. */
-export const later = { layers: null };
+/** What only some streams take: `layers` and `field` decode these sections once who meets one has loaded their modules. */
+export const later = { layers: null, field: null };
 
 /**
  * Decode the sections of a key packet of `size` bytes at `offset`: `{ scene, layout, meta, rest }`, where `rest` is how

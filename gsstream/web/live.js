@@ -1,7 +1,8 @@
 // A stream as it is written: packets from a socket, decoded when they come, the newest one shown.
 
-import { FILE_HEADER, KIND, PACKET_HEADER, checkFileHeader, parseHeader } from "./container.js";
+import "./changes/field.js";
 import "./layers.js";
+import { FILE_HEADER, KIND, PACKET_HEADER, checkFileHeader, parseHeader } from "./container.js";
 import { PacketError } from "./errors.js";
 import { LiveSocket } from "./live-socket.js";
 

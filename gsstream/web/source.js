@@ -1,8 +1,13 @@
 // What there is to play at an address: a manifest with segments, or a stream file with or without an index.
 
+import { sectionsOf } from "./container.js";
 import { SourceError, bytesOf, fileOf } from "./download.js";
 import { FORMAT_MAJOR, FORMAT_MINOR } from "./limits.js";
 import { PacketWalker } from "./walker.js";
+
+const LAYERS = 11;
+/** What only streams with such a section take: they wait for it. */
+const MODULES = { 10: "./changes/field.js", [LAYERS]: "./layers.js" };
 
 /**
  * Find out what is at `url`: `{ segments, frames, fps, renditions }`.
@@ -112,13 +117,10 @@ export async function* packetsOf(segment, signal, onPart) {
     walker ??= make();
     walker.push(chunk);
     for (let packet = walker.next(); packet; packet = walker.next()) {
-      if (isLayered(packet.data)) await import("./layers.js");
+      for (const section of sectionsOf(packet.data)) if (MODULES[section]) await import(MODULES[section]);
       yield packet;
     }
-    if (isLayered(walker.ahead(17))) onPart?.(walker);
+    if (walker.ahead(17)?.[16] === LAYERS) onPart?.(walker);
   }
   (walker ?? make()).finish();
 }
-
-// Section 11 is layers.
-const isLayered = (data) => data?.[16] === 11;

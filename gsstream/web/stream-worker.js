@@ -1,7 +1,7 @@
 // Loads and decodes a stream beside the page's thread. Its messages are those of stream.js.
 
 // All modules at once: one that another one asks for would come a round trip later.
-const MODULES = "stream decode packing source buffer walker download changes/field changes/motion changes/residual changes/rows symbols";
+const MODULES = "stream decode packing source buffer walker download changes/motion changes/residual changes/rows symbols";
 const MORE = "key meta attributes bits container history errors limits texels vendor/fzstd";
 
 const begun = new Map();

@@ -7,6 +7,7 @@ import { createHash } from "node:crypto";
 import { readFileSync } from "node:fs";
 
 import { decodePacket } from "../../gsstream/web/decode.js";
+import "../../gsstream/web/changes/field.js";
 import "../../gsstream/web/layers.js";
 import { decodeJoin } from "../../gsstream/web/joins.js";
 import { sceneBytes } from "./scene-bytes.mjs";

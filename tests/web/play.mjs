@@ -6,6 +6,7 @@
 import { createHash } from "node:crypto";
 import { readFileSync, writeFileSync } from "node:fs";
 
+import "../../gsstream/web/changes/field.js";
 import { KIND } from "../../gsstream/web/container.js";
 import { decodePacket } from "../../gsstream/web/decode.js";
 import { firstLayer } from "../../gsstream/web/layers.js";

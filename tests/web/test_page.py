@@ -258,16 +258,34 @@ def test_the_page_works_in_a_frame_of_another_page(site, tmp_path):
         in_browser(at(url, [["go", "URL/outer.html"], ["until", inner]]), tmp_path, size=SIZE)
 
 
+@pytest.mark.parametrize("name", ["field", "layers", "world"])
+def test_what_only_some_streams_take_is_loaded_when_one_comes(tmp_path, name):
+    """Each stored stream plays to the state of Python; the modules of sections that it has not are not asked for."""
+    stream = Path(__file__).parents[1] / "packet" / "samples" / "2.3" / f"{name}.gss"
+    package(stream, tmp_path / "site")
+    with Playback(stream) as playback:
+        last = playback.frames[-1]
+        means = playback.state_at(last).means.ravel()
+    found = f"{PLAYER}.scene().then(({{ means }}) => Array.from(means))"
+    seek, wait = ["evaluate", f"{PLAYER}.seek({last})"], ["until", f"{PLAYER}.frame === {last}"]
+    steps = [["go", "URL/index.html"], READY, seek, wait, ["evaluate", found]]
+    with serving(tmp_path / "site") as (url, server):
+        results = in_browser(at(url, steps), tmp_path, size=SIZE)
+        asked = {path.removeprefix("/").removesuffix(".js") for path, _ in server.requests}
+    assert np.array_equal(np.float32(results[-1]), means)
+    assert {"changes/field", "layers"} & asked == {"field": {"changes/field"}, "layers": {"layers"}}.get(name, set())
+
+
 def test_the_page_is_small(site):
     import gzip
 
     folder = Path(__file__).parents[2] / "gsstream" / "web"
     files = [p.relative_to(folder) for p in folder.rglob("*") if p.is_file() and "vendor" not in p.parts]
     sizes = {str(name): len(gzip.compress((site / name).read_bytes())) for name in files}
-    # What only a live stream takes, a seek by a join, a stream without a package, a packet with layers and the
-    # statistics is loaded only there.
-    names = ("live", "live-socket", "latency", "joins", "file", "statistics", "layers", "xr")
+    # What only a live stream takes, a seek by a join, a stream without a package, a packet with layers or a field,
+    # a headset and the statistics is loaded only there.
+    names = ("live", "live-socket", "latency", "joins", "file", "statistics", "layers", "xr", "changes/field")
     later = [sizes.pop(f"{name}.js") for name in names]
     assert len(sizes) > 20
-    assert sum(sizes.values()) <= 62_700
-    assert sum(later) <= 11_900
+    assert sum(sizes.values()) <= 60_000
+    assert sum(later) <= 14_900

@@ -2,11 +2,9 @@
 
 import { unpackParts } from "../bits.js";
 import { PacketError } from "../errors.js";
+import { later } from "../key.js";
 import { decodeGates, decodeSymbols } from "../symbols.js";
 import { rodriguesToQuat, rotateQuat, unionRows } from "./motion.js";
-
-/** Sections that this change is made of. */
-export const SECTIONS = ["field"];
 
 const HEAD = 52;
 const OUTPUTS = 7;
@@ -22,7 +20,7 @@ const MAX_ACTIVATION = 2 ** 26 - 1;
  *
  * Its arrays are changed in place. Returns it with the rows of the field among its rows.
  */
-export function decodeField({ data }, moved) {
+function decodeField({ data }, moved) {
   const shape = readHead(data);
   const parts = unpackParts(data.subarray(HEAD), 1 + shape.levels + shape.widths.length - 1);
   const rows = rowsInside(shape, parts[0], moved.means);
@@ -34,6 +32,8 @@ export function decodeField({ data }, moved) {
   for (const row of rows) moveRow(shape, grids, layers, moved, row);
   return { ...moved, rows: unionRows(moved.rows, rows) };
 }
+
+later.field = decodeField;
 
 function demand(holds, what) {
   if (!holds) throw new PacketError(`field: ${what}`);

@@ -1,6 +1,6 @@
 // Whole Gaussians as integers: the attribute sections of a key packet, and the added Gaussians of a delta packet.
 
-import { unpackParts } from "./bits.js";
+import { BitReader, unpackParts } from "./bits.js";
 import { PacketError, located } from "./errors.js";
 import { MAX_BITS, MAX_CODE, WIDTHS } from "./limits.js";
 import { decodeSymbols, within } from "./symbols.js";
@@ -156,20 +156,11 @@ function checkFields(fields, total) {
 
 function place(cells, depths, fields, side) {
   const out = new Float32Array(cells.length);
-  let at = 0;
+  const reader = new BitReader(fields);
   const steps = Float64Array.from({ length: MAX_DEPTH + 1 }, (_, depth) => 2 ** -depth);
   for (let i = 0; i < cells.length; i += 1) {
     const depth = depths[(i / 3) | 0];
-    let field = 0;
-    let left = depth;
-    while (left > 0) {
-      const offset = at & 7;
-      const taken = Math.min(8 - offset, left);
-      field = (field << taken) | ((fields[at >>> 3] >>> (8 - offset - taken)) & ((1 << taken) - 1));
-      at += taken;
-      left -= taken;
-    }
-    out[i] = (cells[i] + field * steps[depth]) * side;
+    out[i] = (cells[i] + reader.bits(depth) * steps[depth]) * side;
   }
   return out;
 }

@@ -17,29 +17,28 @@ export const settings = { patience: 15_000, firstPause: 300, fetch: (...args) =>
 export async function request(url, { start = 0, end = null, ranged = true, signal } = {}) {
   const headers = ranged ? { Range: start < 0 ? `bytes=${start}` : `bytes=${start}-${end ?? ""}` } : {};
   const stall = new AbortController();
-  const stop = () => stall.abort(signal.reason);
-  signal?.addEventListener("abort", stop, { once: true });
-  const timer = setTimeout(() => stall.abort(new SourceError("The server does not answer.")), settings.patience);
-  try {
-    return await settings.fetch(url, { headers, signal: stall.signal });
-  } catch (error) {
-    if (signal?.aborted) throw signal.reason;
-    throw stall.signal.aborted ? stall.signal.reason : error;
-  } finally {
-    clearTimeout(timer);
-  }
+  const either = AbortSignal.any([stall.signal, signal ?? stall.signal]);
+  return patient(settings.fetch(url, { headers, signal: either }), "The server does not answer.", stall);
+}
+
+/** What a promise comes to, or a SourceError with `words` when that takes too long; `stall` then ends it. */
+function patient(promise, words, stall = null) {
+  let timer;
+  const stalled = new Promise((_, reject) => {
+    timer = setTimeout(() => {
+      reject(new SourceError(words));
+      stall?.abort();
+    }, settings.patience);
+  });
+  return Promise.race([promise, stalled]).finally(() => clearTimeout(timer));
 }
 
 /** The chunks of a response's body. A server that sends nothing for long counts as gone. */
-export async function* chunksOf(response, signal) {
+async function* chunksOf(response, signal) {
   const reader = response.body.getReader();
   try {
     for (;;) {
-      let timer;
-      const stalled = new Promise((_, reject) => {
-        timer = setTimeout(() => reject(new SourceError("The server stopped sending.")), settings.patience);
-      });
-      const { value, done } = await Promise.race([reader.read(), stalled]).finally(() => clearTimeout(timer));
+      const { value, done } = await patient(reader.read(), "The server stopped sending.");
       if (signal?.aborted) throw signal.reason;
       if (done) return;
       yield value;

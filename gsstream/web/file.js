@@ -1,34 +1,28 @@
 // A stream file by itself, with or without an index. The player of a package never loads this.
 
 import { FILE_HEADER, parseHeader, parseIndex } from "./container.js";
-import { SourceError, bytesOf, chunksOf, forbidden, joined, refusal, request } from "./download.js";
+import { SourceError, bytesOf, forbidden, joined, refusal, request } from "./download.js";
 
 const TRAILER = 12;
 
 /** What there is to play in the file at `url`, as `openSource` returns it. Throws SourceError. */
 export async function openFile(url, signal) {
   const sequential = { first: null, last: null, url, start: 0, end: null, whole: true };
-  const plain = (answer) => {
-    const opened = (stop) => (answer && !answer.bodyUsed ? continued(answer, url, stop) : null);
-    return { segments: [{ ...sequential, opened }], frames: null, fps: null, renditions: [] };
-  };
+  const plain = { segments: [sequential], frames: null, fps: null, renditions: [] };
   const response = await request(url, { start: -TRAILER, signal }).catch(async (error) => {
     if (!signal?.aborted) await forbidden(url, error);
     throw error instanceof SourceError || signal?.aborted ? error : new SourceError(`There is no server at ${url}.`);
   });
-  if (response.status === 200) return plain(response);
-  if (response.status === 416) return plain();
+  // A server that knows no ranges begins with all of it: it is asked again without one.
+  if (response.status === 200) response.body.cancel();
+  if ([200, 416].includes(response.status)) return plain;
   if (response.status !== 206) throw refusal(response, url);
   const total = /\/(\d+)$/.exec(response.headers.get("Content-Range") ?? "");
   const tail = new Uint8Array(await response.arrayBuffer());
-  if (!total || tail.length !== TRAILER || String.fromCharCode(...tail.subarray(8)) !== "GSSX") return plain();
-  const segments = await indexed(
-    url,
-    Number(new DataView(tail.buffer).getBigUint64(0, true)),
-    Number(total[1]),
-    signal,
-  );
-  if (!segments) return plain();
+  if (!total || tail.length !== TRAILER || String.fromCharCode(...tail.subarray(8)) !== "GSSX") return plain;
+  const offset = Number(new DataView(tail.buffer).getBigUint64(0, true));
+  const segments = await indexed(url, offset, Number(total[1]), signal);
+  if (!segments) return plain;
   const last = segments[segments.length - 1].last;
   return { segments, frames: last - segments[0].first + 1, fps: null, renditions: [] };
 }
@@ -53,19 +47,4 @@ async function indexed(url, offset, total, signal) {
     // Whatever it is, reading the file from its beginning says what is wrong and plays what is sound.
     return null;
   }
-}
-
-/** The body of an answer that is there already; when it breaks off, the rest is asked for. */
-async function* continued(body, url, signal) {
-  let at = 0;
-  try {
-    for await (const chunk of chunksOf(body, signal)) {
-      at += chunk.length;
-      yield chunk;
-    }
-    return;
-  } catch (error) {
-    if (signal?.aborted) throw error;
-  }
-  yield* bytesOf(url, { start: at, signal });
 }

@@ -10,18 +10,10 @@ function reasonOf(opened, { code, reason }, host) {
   return opened ? "The connection to the server is cut" : `No live stream answers at ${host}`;
 }
 
-/**
- * Keeps a WebSocket open from `start` to `stop`.
- *
- * `handlers`: `address()` gives the URL for the next connection; `opened()`; `message(data)` gets an ArrayBuffer or an
- * object; `trouble(sentence)` says why there is no connection; `over()` whether the stream has ended, so that a
- * connection that breaks is not missed.
- */
+/** Keeps a WebSocket of a LiveBuffer open from `start` to `stop`. */
 export class LiveSocket {
-  constructor(handlers) {
-    this.handlers = handlers;
-    this.socket = null;
-    this.failures = 0;
+  constructor(buffer) {
+    Object.assign(this, { buffer, socket: null, failures: 0 });
     /** Milliseconds by which the server's clock is ahead of ours, and the round trip in which that was measured. */
     this.ahead = 0;
     this.round = Infinity;
@@ -49,7 +41,7 @@ export class LiveSocket {
 
   /** The connection broke. */
   _lost(sentence) {
-    if (this.handlers.over()) this.stop();
+    if (this.buffer.over) this.stop();
     else this.again(sentence);
   }
 
@@ -60,7 +52,7 @@ export class LiveSocket {
 
   _connect() {
     this.timer = null;
-    const address = this.handlers.address();
+    const address = this.buffer.address();
     let socket;
     try {
       socket = new WebSocket(address);
@@ -75,7 +67,7 @@ export class LiveSocket {
     socket.onopen = () => {
       opened = true;
       if (this.socket !== socket) return;
-      this.handlers.opened();
+      this.buffer.opened();
       // A page that is just beginning is busy: the first answers are read late.
       for (let i = 0; i < 8; i += 1) setTimeout(() => this._ask(socket), i * settings.first);
     };
@@ -91,7 +83,7 @@ export class LiveSocket {
 
   _received(data) {
     if (typeof data !== "string") {
-      this.handlers.message(data);
+      this.buffer.came(new Uint8Array(data));
       return;
     }
     let message = null;
@@ -100,9 +92,8 @@ export class LiveSocket {
     } catch {
       // Not ours: whatever it is, the packets say by themselves whether they are sound.
     }
-    if (message === null || typeof message !== "object") return;
-    if ("pong" in message) this._answered(message);
-    else this.handlers.message(message);
+    if (message?.pong !== undefined) this._answered(message);
+    else this.buffer.said(message ?? {});
   }
 
   _answered({ pong, now }) {
@@ -129,6 +120,6 @@ export class LiveSocket {
     const pause = pauses[Math.min(this.failures, pauses.length - 1)] * (0.75 + Math.random() / 2);
     this.failures += 1;
     this.timer = setTimeout(() => this._connect(), pause);
-    this.handlers.trouble(`${sentence}; trying again in ${Math.max(1, Math.round(pause / 1000))} s.`);
+    this.buffer.trouble(`${sentence}; trying again in ${Math.max(1, Math.round(pause / 1000))} s.`);
   }
 }

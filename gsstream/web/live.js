@@ -14,34 +14,13 @@ export const settings = { quiet: 10_000 };
 /** Stands where a recording has its buffer (see buffer.js); the stream calls `feed` when the page can show more. */
 export class LiveBuffer {
   constructor(url, stream) {
-    this.live = true;
-    this.url = url;
-    this.stream = stream;
-    this.fps = 30;
-    this.received = 0;
-    this.first = null;
-    this.last = null;
-    this.lastLoaded = null;
-    this.queue = [];
-    this.waiting = 0;
+    Object.assign(this, { url, stream, live: true, fps: 30, received: 0, first: null, last: null, lastLoaded: null });
+    Object.assign(this, { queue: [], waiting: 0, gaps: [], told: "" });
     /** Bytes that may wait to be decoded. A page that is not shown takes no more and catches up later. */
     this.most = 16 * 2 ** 20;
     this.state = { name: "live", detail: "" };
-    this.trouble = null;
-    this.broken = this.joined = null;
-    this.said = "";
-    this.before = null;
-    this.gaps = [];
-    this.socket = new LiveSocket({
-      address: () => this._address(),
-      opened: () => this._opened(),
-      message: (data) => this._message(data),
-      trouble: (sentence) => {
-        this.trouble = sentence;
-        this._tell();
-      },
-      over: () => this.state.name === "ended" && !this.broken,
-    });
+    this.cut = this.broken = this.joined = this.before = null;
+    this.socket = new LiveSocket(this);
     this.clock = setInterval(() => this._tell(), 500);
     this.socket.start();
   }
@@ -55,13 +34,13 @@ export class LiveBuffer {
   resume() {
     this.asleep = false;
     this.at = null;
-    this.said = "";
+    this.told = "";
     this.socket.start();
   }
 
   /** Take no more packets; what comes meanwhile is caught up with later. */
   pause() {
-    this.trouble = null;
+    this.cut = null;
     this.socket.stop();
     this._tell();
   }
@@ -110,8 +89,10 @@ export class LiveBuffer {
     }
   }
 
+  // What the socket asks and says.
+
   /** Where to connect. Whoever comes again says what it has, and gets only what follows that. */
-  _address() {
+  address() {
     const url = new URL(this.url);
     if (this.before && !this.broken) {
       url.searchParams.set("after", this.before.frame);
@@ -120,19 +101,37 @@ export class LiveBuffer {
     return url.href;
   }
 
-  _opened() {
+  opened() {
     this.joined ??= Date.now();
     this.begun = false;
     this.at = null;
   }
 
-  _message(data) {
-    if (!(data instanceof ArrayBuffer)) {
-      if ("state" in data) this._stateIs(data);
-      else if (Number.isFinite(data.written)) this._written(data);
-      return;
+  /** There is no connection, and why. */
+  trouble(sentence) {
+    this.cut = sentence;
+    this._tell();
+  }
+
+  /** Whether the stream has ended, so that a connection that breaks is not missed. */
+  get over() {
+    return this.state.name === "ended" && !this.broken;
+  }
+
+  /** The server says how the stream is, or when it wrote a packet: this clock is behind the server's. */
+  said({ state, detail, frame, written }) {
+    const { ahead } = this.socket;
+    if (state !== undefined) {
+      this.state = { name: state, detail: String(detail ?? "") };
+      this.cut = null;
+      this._tell();
+    } else if (Number.isFinite(written)) {
+      this.stream.say({ written: { frame, written, came: Date.now() + ahead, ahead, joined: this.joined + ahead } });
     }
-    const bytes = new Uint8Array(data);
+  }
+
+  /** The header of the stream, or a packet. */
+  came(bytes) {
     this.received += bytes.length;
     try {
       if (!this.begun || bytes[0] === 0x89) this._begin(bytes);
@@ -140,18 +139,6 @@ export class LiveBuffer {
     } catch (error) {
       this._refuse(error);
     }
-  }
-
-  /** Say when a packet was written, when it came, and by what this clock is behind the server's. */
-  _written({ frame, written }) {
-    const { ahead } = this.socket;
-    this.stream.say({ written: { frame, written, came: Date.now() + ahead, ahead, joined: this.joined + ahead } });
-  }
-
-  _stateIs({ state, detail }) {
-    this.state = { name: state, detail: String(detail ?? "") };
-    this.trouble = null;
-    this._tell();
   }
 
   /** The header of a stream. A second one on a connection: another stream begins. */
@@ -176,7 +163,7 @@ export class LiveBuffer {
     this.before = { frame: header.frame, head: hex(data.subarray(0, PACKET_HEADER)) };
     this.queue.push({ data, offset: 0, header });
     this.waiting += data.length;
-    this.trouble = null;
+    this.cut = null;
     this.socket.sound();
     this._timed();
     this.feed();
@@ -210,7 +197,7 @@ export class LiveBuffer {
   }
 
   _sentence() {
-    if (this.trouble) return this.trouble;
+    if (this.cut) return this.cut;
     if (this.broken) return sentence(this.broken);
     const { name, detail } = this.state;
     if (name === "ended") return "The stream has ended.";
@@ -222,8 +209,8 @@ export class LiveBuffer {
 
   _tell() {
     const text = this._sentence();
-    if (text === this.said) return;
-    this.said = text;
+    if (text === this.told) return;
+    this.told = text;
     this.stream.say({ problem: text, ended: false });
   }
 }

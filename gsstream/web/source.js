@@ -109,7 +109,7 @@ function piecesOf(segment, entry, base) {
  */
 export async function* packetsOf(segment, signal, onPart) {
   const all = segment.all && { ...segment.all, sent: false };
-  const chunks = segment.opened?.(signal) ?? bytesOf(segment.url, { ...segment, all, signal });
+  const chunks = bytesOf(segment.url, { ...segment, all, signal });
   // Whether the server sends the piece or the whole file is known with the first bytes.
   const make = () => (all?.sent ? new PacketWalker(0) : new PacketWalker(segment.start, segment.join && segment.first));
   let walker = null;

@@ -29,7 +29,9 @@ export class PacketWalker {
 
   /** The next `size` bytes, which stay; null until they are there. */
   ahead(size) {
-    return this.size < size ? null : this._peek(size);
+    if (this.size < size) return null;
+    if (size && this.chunks[0].length < size) this.chunks = [concatenated(this.chunks, this.size)];
+    return this.chunks[0]?.subarray(0, size) ?? new Uint8Array(0);
   }
 
   /** The next complete packet `{ data, offset, header }`, or null until more bytes come. Throws PacketError. */
@@ -54,7 +56,7 @@ export class PacketWalker {
 
   /** After the last byte: throws PacketError when not even the file header is there. What is unfinished is ignored. */
   finish() {
-    if (this.whole && this.version === null) checkFileHeader(this._peek(this.size));
+    if (this.whole && this.version === null) checkFileHeader(this.ahead(this.size));
     if (this.last === null) throw new PacketError("the stream holds no complete packet yet", this.offset);
   }
 
@@ -83,30 +85,22 @@ export class PacketWalker {
     if (!same) throw new PacketError("the index does not describe this stream", offset);
   }
 
-  _peek(size) {
-    if (this.chunks.length && this.chunks[0].length >= size) return this.chunks[0].subarray(0, size);
-    const joined = new Uint8Array(Math.max(size, 0));
-    let at = 0;
-    for (const chunk of this.chunks) {
-      const part = chunk.subarray(0, size - at);
-      joined.set(part, at);
-      at += part.length;
-      if (at === size) break;
-    }
-    return joined;
-  }
-
   _take(size) {
-    const data = this._peek(size).slice();
-    let left = size;
-    while (left > 0) {
-      const chunk = this.chunks[0];
-      if (chunk.length <= left) this.chunks.shift();
-      else this.chunks[0] = chunk.subarray(left);
-      left -= Math.min(left, chunk.length);
-    }
+    const data = this.ahead(size).slice();
+    this.chunks[0] = this.chunks[0].subarray(size);
+    if (!this.chunks[0].length) this.chunks.shift();
     this.size -= size;
     this.offset += size;
     return data;
   }
+}
+
+function concatenated(chunks, size) {
+  const out = new Uint8Array(size);
+  let at = 0;
+  for (const chunk of chunks) {
+    out.set(chunk, at);
+    at += chunk.length;
+  }
+  return out;
 }

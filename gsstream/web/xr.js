@@ -11,22 +11,19 @@ const LEFT = 0.15;
 const SMALLEST = 0.6;
 
 /**
- * The camera (see Renderer) of an XRView: `place` `{ rotation (9, row by row), offset (3), scale }` takes the stream to
- * the space of the session; `recorded` is a view of the recording.
+ * The camera (see Renderer) of an XRView. `place`, a DOMMatrix, takes the stream to the space of the session; `recorded`
+ * is a view of the recording.
  */
 export function cameraOfView(view, { width, height }, place, recorded) {
-  const m = view.transform.inverse.matrix; // column by column; x right, y up, z back
-  const columns = [0, 1, 2].map((k) => [0, 3, 6].map((row) => place.rotation[row + k]));
-  const rows = [0, 1, 2].map((i) => {
-    const sign = i ? -1 : 1;
-    const line = [m[i], m[4 + i], m[8 + i]].map((v) => sign * v);
-    return [...columns.map((column) => dot(line, column)), (dot(line, place.offset) + sign * m[12 + i]) / place.scale];
-  });
+  const metres = Math.hypot(place.m11, place.m12, place.m13);
+  const seen = new DOMMatrix(Array.from(view.transform.inverse.matrix)).multiply(place);
+  // The axes of a view point right, up and back.
+  const columns = new DOMMatrix().scale(1 / metres, -1 / metres, -1 / metres).multiply(seen).toFloat64Array();
   const p = view.projectionMatrix;
   const fx = (p[0] * width) / 2;
   return {
-    viewmat: [...rows.flat(), 0, 0, 0, 1],
-    near: Math.max(recorded.near, 0.05 / place.scale),
+    viewmat: Array.from(columns, (_, i) => columns[4 * (i % 4) + (i >> 2)]),
+    near: Math.max(recorded.near, 0.05 / metres),
     scale: fx / recorded.fx,
     width,
     height,
@@ -38,11 +35,12 @@ export function cameraOfView(view, { width, height }, place, recorded) {
 }
 
 /** Stand where a camera of the recording stands, looking level; `metres` for one unit of the stream. */
-export function placeAt(view, up, metres) {
-  const back = unit(add(view.forward, up, -dot(view.forward, up)).map((v) => -v));
-  const rotation = [...cross(up, back), ...up, ...back];
-  const offset = [0, 3, 6].map((row) => -metres * dot(rotation.slice(row, row + 3), view.eye));
-  return { rotation, offset: add(offset, [0, EYES, 0]), scale: metres };
+export function placeAt({ forward, eye }, up, metres) {
+  const back = unit(add(forward, up, -dot(forward, up)).map((v) => -v));
+  const right = cross(up, back);
+  const columns = [0, 1, 2].flatMap((k) => [right[k], up[k], back[k], 0]);
+  const turn = new DOMMatrix([...columns, 0, 0, 0, 1]);
+  return new DOMMatrix().translate(0, EYES, 0).scale3d(metres).multiply(turn).translate(...eye.map((v) => -v));
 }
 
 /** A place moved so that what hands held at points `from` is where they are, `to`: one hand moves, two turn and scale. */
@@ -52,16 +50,12 @@ export function grabbed(place, from, to) {
   const [before, after] = [arm(from), arm(to)];
   const factor = Math.hypot(...after) / (Math.hypot(...before) || 1) || 1;
   const angle = Math.atan2(before[2], before[0]) - Math.atan2(after[2], after[0]);
-  const [c, s] = [Math.cos(angle), Math.sin(angle)];
-  const turned = ([x, y, z]) => [c * x + s * z, y, c * z - s * x];
-  const [zero, one, two] = [0, 3, 6].map((row) => place.rotation.slice(row, row + 3));
-  const mixed = (a, b) => zero.map((v, i) => a * v + b * two[i]);
-  const offset = turned(add(place.offset, middle(from), -1)).map((v) => v * factor);
-  return {
-    rotation: [...mixed(c, s), ...one, ...mixed(-s, c)],
-    offset: add(offset, middle(to)),
-    scale: place.scale * factor,
-  };
+  return new DOMMatrix()
+    .translate(...middle(to))
+    .rotateAxisAngle(0, 1, 0, (angle * 180) / Math.PI)
+    .scale3d(factor)
+    .translate(...middle(from).map((v) => -v))
+    .multiply(place);
 }
 
 /** Shows what a player plays in a headset, from `enter` until the session ends. */
@@ -155,12 +149,10 @@ export class Headset {
 
   /** How far the head is from where cameras stood. */
   _outside({ position }) {
-    const { rotation, offset, scale } = this.place;
     const { region, view, pivot } = this.player;
     if (!region) return 0;
-    const away = [position.x - offset[0], position.y - offset[1], position.z - offset[2]].map((v) => v / scale);
-    const eye = [0, 1, 2].map((k) => rotation[k] * away[0] + rotation[3 + k] * away[1] + rotation[6 + k] * away[2]);
-    return outside(region, { ...view, eye }, pivot);
+    const { x, y, z } = this.place.inverse().transformPoint(position);
+    return outside(region, { ...view, eye: [x, y, z] }, pivot);
   }
 
   /** Smaller windows where pictures come late, larger ones again where they do not. */
@@ -180,13 +172,7 @@ export class Headset {
       if (before) pairs.push([before, [x, y, z]]);
       this.held.set(source, [x, y, z]);
     }
-    const used = pairs.slice(0, 2);
-    if (used.length) {
-      this.place = grabbed(
-        this.place,
-        used.map(([from]) => from),
-        used.map(([, to]) => to),
-      );
-    }
+    const [from, to] = [0, 1].map((when) => pairs.slice(0, 2).map((pair) => pair[when]));
+    if (from.length) this.place = grabbed(this.place, from, to);
   }
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import os
 import shutil
 from pathlib import Path
@@ -10,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser_runs import MESSAGE, PLAYER, ROOT, at, in_browser, needs_browser, serving, try_in_browser
-from node_runs import needs_node, node
 from pictures import psnr
 
 from gsstream.core.cameras import Cameras
@@ -166,7 +166,10 @@ def test_a_lost_context_ends_the_session_and_the_page_goes_on(room, tmp_path):
 @needs_browser
 @needs_iwer
 def test_hands_move_and_heads_that_leave_are_not_pushed(room, tmp_path):
-    place = ["evaluate", f"[{HEADSET}.place.offset, {HEADSET}.place.scale]"]
+    place = [
+        "evaluate",
+        f"(({{ m11, m12, m13, m41, m42, m43 }}) => [[m41, m42, m43], Math.hypot(m11, m12, m13)])({HEADSET}.place)",
+    ]
     hand = "device.controllers.right"
     later = ["until", f"{HEADSET}.pictures > window.since + 6"]
     since = f"window.since = {HEADSET}.pictures"
@@ -175,10 +178,10 @@ def test_hands_move_and_heads_that_leave_are_not_pushed(room, tmp_path):
         later,
         ["evaluate", f"{hand}.position.set(0.5, 1.5, -0.3), {since}"], later, place,
         ["evaluate", f"{hand}.updateButtonValue('trigger', 0), device.position.set(0, 1.6, 30), {since}"], later,
-        ["evaluate", f"[{HEADSET}._outside({{ position: device.position }}), {HEADSET}.place.offset]"],
+        ["evaluate", f"{HEADSET}._outside({{ position: device.position }})"], place,
     ]  # fmt: skip
     results = look(room, tmp_path, steps)
-    (before, scale), (after, same), (outside, kept) = results[0], results[5], results[8]
+    (before, scale), (after, same), outside, (kept, _) = (results[i] for i in (0, 5, 8, 9))
     assert np.subtract(after, before) == pytest.approx([0.3, 0.1, 0], abs=0.02)
     assert same == pytest.approx(scale)
     assert outside == 1
@@ -211,28 +214,31 @@ def test_without_a_device_there_is_no_button_and_without_https_a_sentence(site, 
     assert results[-1] is True
 
 
-@needs_node
-def test_what_hands_hold_stays_in_them(tmp_path):
+@needs_browser
+def test_what_hands_hold_stays_in_them(site, tmp_path):
     """Two points of the stream lie in the hands before and after, whatever the hands do about the vertical."""
-    code = """
-    const { grabbed } = await load('xr.js');
-    return given.map(({ place, from, to }) => grabbed(place, from, to));"""
     rng = np.random.default_rng(3)
     cases = []
     for _ in range(20):
         q, _r = np.linalg.qr(rng.normal(size=(3, 3)))
-        q *= np.sign(np.linalg.det(q))
-        place = {"rotation": q.ravel().tolist(), "offset": rng.normal(size=3).tolist(), "scale": 0.7}
+        place = np.eye(4)
+        place[:3, :3], place[:3, 3] = 0.7 * q * np.sign(np.linalg.det(q)), rng.normal(size=3)
         start = rng.normal(size=(2, 3))
         start[1, 1] = start[0, 1]
         angle, factor = rng.uniform(-3, 3), rng.uniform(0.5, 2)
         turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
         end = factor * start @ turn.T + rng.normal(size=3)
-        cases.append({"place": place, "from": start.tolist(), "to": end.tolist()})
-    for case, found in zip(cases, node(code, cases, tmp_path), strict=True):
-        old = np.array(case["place"]["rotation"]).reshape(3, 3)
-        new = np.array(found["rotation"]).reshape(3, 3)
-        assert new @ new.T == pytest.approx(np.eye(3), abs=1e-9)
-        assert new[1] == pytest.approx(old[1]), "the floor stays level"
-        held = (np.array(case["from"]) - case["place"]["offset"]) @ old / case["place"]["scale"]
-        assert found["scale"] * held @ new.T + found["offset"] == pytest.approx(np.array(case["to"]), abs=1e-9)
+        cases.append((place, start, end))
+    given = json.dumps([[place.T.ravel().tolist(), *map(np.ndarray.tolist, hands)] for place, *hands in cases])
+    code = f"""import('./xr.js').then(({{ grabbed }}) => {given}.map(
+      ([place, from, to]) => Array.from(grabbed(new DOMMatrix(place), from, to).toFloat64Array())))"""
+    with serving(site) as (url, _):
+        found = in_browser([["go", f"{url}/index.html"], ["evaluate", code]], tmp_path)[-1]
+    for (place, start, end), numbers in zip(cases, found, strict=True):
+        after = np.reshape(numbers, (4, 4)).T
+        assert after[3] == pytest.approx([0, 0, 0, 1])
+        turned = after[:3, :3] / np.cbrt(np.linalg.det(after[:3, :3]))
+        assert turned @ turned.T == pytest.approx(np.eye(3), abs=1e-6)
+        assert turned[1] == pytest.approx(place[1, :3] / 0.7, abs=1e-6), "the floor stays level"
+        held = np.linalg.solve(place[:3, :3], (start - place[:3, 3]).T).T
+        assert held @ after[:3, :3].T + after[:3, 3] == pytest.approx(end, abs=1e-6)

@@ -225,11 +225,8 @@ function transformMean(means, row, quats, centre, translation, k) {
   means[3 * row] = t0 + centre[3 * k] + translation[3 * k];
   means[3 * row + 1] = t1 + centre[3 * k + 1] + translation[3 * k + 1];
   means[3 * row + 2] = t2 + centre[3 * k + 2] + translation[3 * k + 2];
-  if (
-    !Number.isFinite(means[3 * row]) ||
-    !Number.isFinite(means[3 * row + 1]) ||
-    !Number.isFinite(means[3 * row + 2])
-  ) {
+  // Zero times infinity is no number.
+  if (0 * means[3 * row] + 0 * means[3 * row + 1] + 0 * means[3 * row + 2] !== 0) {
     throw new PacketError("motion: it leads to positions beyond the range of float32");
   }
 }

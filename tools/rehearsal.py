@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from gsstream.core.errors import InputError
-from gsstream.encode import open_recording
+from gsstream.encode import Source, open_recording
 from gsstream.input.recordings.calibration import CALIBRATION_FILE
 from gsstream.input.recordings.open import DEMO_FOLDER
 from tools.drill import there_and_back
@@ -39,30 +39,48 @@ sys.path.insert(0, str(ROOT / "plugins" / "capture" / "tests"))
 LENGTH, JITTER = 400, 8
 
 
-def rehearse(finished: Path, out: Path, given: argparse.Namespace) -> dict[str, Any]:
-    """Serve a recording, capture it, and return what is reported. Raises InputError where ``out`` is not new."""
-    from live_rig import Capturing, Server, encoded, painted, rig_file
+def recording_of(text: str) -> str:
+    """Return the folder of a recording that a command names."""
+    return str(DEMO_FOLDER) if text == "demo" else text
+
+
+def prepared(
+    source: Source, out: Path, names: Sequence[str], *, rate: float, fps: float
+) -> tuple[dict[str, Path], float, dict[str, Any], Path]:
+    """Encode cameras of a recording ahead, serve them from now on, and write a rig file.
+
+    Returns encoded pictures by camera, when their picture 0 was, the servers, and the rig file. Raises InputError where
+    ``out`` is not new.
+    """
+    from live_rig import Server, encoded, painted, rig_file
 
     if out.exists():
         raise InputError(f"{out} exists; expected a new folder, choose another --out")
     out.mkdir(parents=True)
-    shutil.copyfile(finished / CALIBRATION_FILE, out / CALIBRATION_FILE)
-    with open_recording(str(finished)) as source:
-        names = list(source.info.train.ids[: given.cameras])
+    shutil.copyfile(Path(source.info.uri) / CALIBRATION_FILE, out / CALIBRATION_FILE)
 
-        def pictures(name: str) -> Iterator[Any]:
-            length = source.info.num_frames or 1
-            for index in range(LENGTH):
-                image = source.image(there_and_back(index, length), name)
-                yield painted(np.round(255 * image).astype(np.uint8), index)
+    def pictures(name: str) -> Iterator[Any]:
+        length = source.info.num_frames or 1
+        for index in range(LENGTH):
+            image = source.image(there_and_back(index, length), name)
+            yield painted(np.round(255 * image).astype(np.uint8), index)
 
-        units = {name: encoded(out / name, pictures(name), round(given.fps)) for name in names}
+    units = {name: encoded(out / name, pictures(name), round(rate)) for name in names}
     epoch = time.time()
-    servers = {name: Server({name: units[name]}, given.fps, epoch) for name in names}
+    servers = {name: Server({name: units[name]}, rate, epoch) for name in names}
     for name, server in servers.items():
         server.say(f"jitter {name} {JITTER}")
+    return units, epoch, servers, rig_file(out, {name: server.url(name) for name, server in servers.items()}, fps)
+
+
+def rehearse(finished: str, out: Path, given: argparse.Namespace) -> dict[str, Any]:
+    """Serve a recording, capture it, and return what is reported. Raises InputError where ``out`` is not new."""
+    from live_rig import Capturing
+
+    with open_recording(finished) as source:
+        names = list(source.info.train.ids[: given.cameras])
+        units, epoch, servers, rig = prepared(source, out, names, rate=given.fps, fps=given.fps)
     servers[names[1]].say(f"delay {names[1]} {given.late}")
-    rig = rig_file(out, {name: server.url(name) for name, server in servers.items()}, given.fps)
     memory: list[int] = []
     try:
         capture = Capturing(rig, out / "capture", "--seconds", str(given.seconds))
@@ -71,7 +89,7 @@ def rehearse(finished: Path, out: Path, given: argparse.Namespace) -> dict[str, 
             lost = (servers, names[2], units[names[2]], epoch)
             threading.Thread(target=_unplug, args=(*lost, given), daemon=True).start()
         while capture.process.poll() is None:
-            memory.append(_resident(capture.process.pid))
+            memory.append(resident_mb(capture.process.pid))
             time.sleep(1.0)
         code = capture.end()
     finally:
@@ -82,13 +100,17 @@ def rehearse(finished: Path, out: Path, given: argparse.Namespace) -> dict[str, 
 
 
 def _unplug(servers: dict[str, Any], name: str, units: Path, epoch: float, given: argparse.Namespace) -> None:
-    from live_rig import Server
-
     time.sleep(given.seconds / 3)
-    port = servers[name].port
     servers[name].stop()
     time.sleep(given.unplug)
-    servers[name] = Server({name: units}, given.fps, epoch, port=port)
+    servers[name] = restarted(servers[name], name, units, given.fps, epoch=epoch)
+
+
+def restarted(server: Any, name: str, units: Path, rate: float, *, epoch: float) -> Any:
+    """Return a camera that is back at the address of one that was stopped."""
+    from live_rig import Server
+
+    return Server({name: units}, rate, epoch, port=server.port)
 
 
 def reported(folder: Path, names: Sequence[str]) -> dict[str, Any]:
@@ -110,7 +132,8 @@ def reported(folder: Path, names: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _resident(process: int) -> int:
+def resident_mb(process: int) -> int:
+    """Return the resident size of a process in MB; 0 when it is gone."""
     try:
         text = Path(f"/proc/{process}/status").read_text(encoding="ascii")
     except OSError:
@@ -132,8 +155,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     if not 3 <= given.cameras <= 64 or given.fps <= 0 or given.seconds <= 0:
         raise InputError("expected 3 to 64 cameras, and --fps and --seconds above 0")
-    finished = DEMO_FOLDER if given.source == "demo" else Path(given.source)
-    text = json.dumps(rehearse(finished, given.out, given), indent=1)
+    text = json.dumps(rehearse(recording_of(given.source), given.out, given), indent=1)
     (given.out / "rehearsal.json").write_text(text + "\n", encoding="utf-8")
     print(text)
     return 0

@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import os
 import random
 import signal
 import subprocess
@@ -35,12 +34,12 @@ from gsstream.core.errors import GsstreamError, InputError
 from gsstream.encode import open_recording
 from gsstream.engine.run.session import METRICS, STREAM
 from gsstream.evaluation.records import read_lines
-from gsstream.player.playback import Playback
 from tools.drill import GSSTREAM
-from tools.rehearsal import prepared, recording_of, reported, resident_mb, restarted
+from tools.rehearsal import prepared, recording_of, reported, restarted
+from tools.sampling import Lines, decoded_frames, grown, records, sample_until
 
-#: Seconds between two samples; between two faults, drawn; and that the run gets to end after its cameras are gone.
-SAMPLE, BETWEEN, ENDING = 10.0, (30.0, 90.0), 180.0
+#: Seconds between two faults, drawn; and that the run gets to end after its cameras are gone.
+BETWEEN, ENDING = (30.0, 90.0), 180.0
 #: Seconds at the beginning and at the end in which nothing is done to the cameras.
 PEACE = 60.0
 
@@ -57,15 +56,15 @@ def hour(finished: str, out: Path, given: argparse.Namespace, options: Sequence[
     with (out / "run.log").open("w") as log, subprocess.Popen(command, stdout=log, stderr=log) as process:
         try:
             _wait_for(out / "run" / METRICS, process)
-            began = time.monotonic()
+            began, captured = time.monotonic(), Lines(out / "capture" / "capture.jsonl")
             faults = _Faults(servers, units, epoch, out / "faults.jsonl", given=given, over=over)
             faults.start()
-            _sample_until(began + 60 * given.minutes, process, out)
+            sample_until(began + 60 * given.minutes, process, out, more=captured)
             over.set()
             faults.join()
             for server in servers.values():
                 server.stop()
-            _sample_until(time.monotonic() + ENDING, process, out)
+            sample_until(time.monotonic() + ENDING, process, out, more=captured)
         finally:
             over.set()
             for server in servers.values():
@@ -82,64 +81,6 @@ def _wait_for(path: Path, process: subprocess.Popen[Any]) -> None:
         if process.poll() is not None:
             raise GsstreamError(f"the run ended with {process.returncode} before its first frame")
         time.sleep(0.5)
-
-
-def _sample_until(end: float, process: subprocess.Popen[Any], out: Path) -> None:
-    """Write a line every ten seconds while the run lives."""
-    captured, encoded = _Lines(out / "capture" / "capture.jsonl"), _Lines(out / "run" / METRICS)
-    with (out / "samples.jsonl").open("a", encoding="utf-8") as file:
-        while time.monotonic() < end and process.poll() is None:
-            line = {
-                "time": round(time.time(), 1),
-                "run": facts_of(process.pid),
-                "capture": next(map(facts_of, _children(process.pid)), None),
-                "files_of_the_run": len(list((out / "run").iterdir())),
-                "instants": captured.count(),
-                "frames": encoded.count(),
-                "bytes": (out / "run" / STREAM).stat().st_size,
-                "load": os.getloadavg()[0],
-            }
-            file.write(json.dumps(line) + "\n")
-            file.flush()
-            time.sleep(SAMPLE)
-
-
-class _Lines:
-    """How many lines a growing file has; each look reads what came since the one before."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._at, self._lines = path, 0, 0
-
-    def count(self) -> int:
-        with self._path.open("rb") as file:
-            file.seek(self._at)
-            data = file.read()
-        self._at, self._lines = self._at + len(data), self._lines + data.count(b"\n")
-        return self._lines
-
-
-def facts_of(process: int) -> dict[str, float] | None:
-    """Return memory in MB, descriptors, threads and processor seconds of a process; None when it is gone (Linux)."""
-    place = Path(f"/proc/{process}")
-    try:
-        fields = (place / "stat").read_text(encoding="ascii").rpartition(")")[2].split()
-        ticks = int(fields[11]) + int(fields[12])
-        descriptors, threads = len(list((place / "fd").iterdir())), len(list((place / "task").iterdir()))
-    except OSError:
-        return None
-    seconds = round(ticks / os.sysconf("SC_CLK_TCK"), 1)
-    return {"mb": resident_mb(process), "descriptors": descriptors, "threads": threads, "cpu_s": seconds}
-
-
-def _children(process: int) -> list[int]:
-    """Processes that capture, of a run."""
-    found = []
-    for task in Path(f"/proc/{process}/task").glob("*/children"):
-        try:
-            found += [int(child) for child in task.read_text(encoding="ascii").split()]
-        except OSError:
-            continue
-    return sorted(found)
 
 
 class _Faults(threading.Thread):
@@ -189,12 +130,12 @@ class _Faults(threading.Thread):
 
 def accounted(out: Path, names: Sequence[str], fps: float) -> dict[str, Any]:
     """Return what became of every instant from the first to the last; one without a word is a GsstreamError."""
-    told = _records(out / "capture" / "capture.jsonl")
+    told = records(out / "capture" / "capture.jsonl")
     lines = read_lines(out / "run" / METRICS)
     times = [line["time"] for line in told]
     # Instants follow one another by the clock of the cameras, within 5 % of the rig's rate.
     gaps = [round((b - a) * fps) - 1 for a, b in itertools.pairwise(times)]
-    decoded, kinds = _decoded(out / "run" / STREAM)
+    decoded, kinds = decoded_frames(out / "run" / STREAM)
     frames = [line["frame"] for line in lines]
     if not frames == decoded == list(range(len(told))):
         raise GsstreamError(f"{len(told)} instants captured, {len(frames)} lines, {len(decoded)} frames decoded")
@@ -215,22 +156,9 @@ def accounted(out: Path, names: Sequence[str], fps: float) -> dict[str, Any]:
         "frames_decoded": len(decoded),
         "packets": kinds,
         "policies": dict(policies),
-        "faults": dict(Counter(fault["what"] for fault in _records(out / "faults.jsonl"))),
-        **grown(_records(out / "samples.jsonl")),
+        "faults": dict(Counter(fault["what"] for fault in records(out / "faults.jsonl"))),
+        **grown(records(out / "samples.jsonl")),
     }
-
-
-def _records(path: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-
-
-def _decoded(stream: Path) -> tuple[list[int], dict[str, int]]:
-    with Playback(stream) as playback:
-        found = []
-        for frame in playback.frames:
-            playback.player_state(frame)
-            found.append(frame)
-        return found, dict(Counter(playback.entry(frame).kind.name.lower() for frame in found))
 
 
 def _named_files(folder: Path, told: Sequence[dict[str, Any]], names: Sequence[str]) -> str:
@@ -240,19 +168,6 @@ def _named_files(folder: Path, told: Sequence[dict[str, Any]], names: Sequence[s
         if there != {line["frame"] for line in told if name not in line["absent"]}:
             raise GsstreamError(f"{folder / name}: the pictures are not those that capture.jsonl names")
     return "all"
-
-
-def grown(samples: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return memory and descriptors of both processes at the beginning, in the middle and at the end, and the most."""
-    full = [sample for sample in samples if sample["run"] and sample["capture"]]
-    # The first fifth holds the first frame and its refinement.
-    at = [full[int(share * (len(full) - 1))] for share in (0.2, 0.4, 0.6, 0.8, 1.0)]
-    out: dict[str, Any] = {}
-    for process in ("run", "capture"):
-        for key in ("mb", "descriptors", "threads"):
-            out[f"{process}_{key}"] = [sample[process][key] for sample in at]
-            out[f"{process}_most_{key}"] = max(sample[process][key] for sample in full)
-    return out | {"files_of_the_run": [sample["files_of_the_run"] for sample in at]}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -32,6 +32,7 @@ from gsstream.encode import Source, open_recording
 from gsstream.input.recordings.calibration import CALIBRATION_FILE
 from gsstream.input.recordings.open import DEMO_FOLDER
 from tools.drill import there_and_back
+from tools.sampling import resident_mb
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "plugins" / "capture" / "tests"))
@@ -130,16 +131,6 @@ def reported(folder: Path, names: Sequence[str]) -> dict[str, Any]:
         "to_file_ms": median(line["written_ms"] for line in lines),
         "load": os.getloadavg()[0],
     }
-
-
-def resident_mb(process: int) -> int:
-    """Return the resident size of a process in MB; 0 when it is gone."""
-    try:
-        text = Path(f"/proc/{process}/status").read_text(encoding="ascii")
-    except OSError:
-        return 0
-    found = [line.split()[1] for line in text.splitlines() if line.startswith("VmRSS")]
-    return int(found[0]) // 1024 if found else 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

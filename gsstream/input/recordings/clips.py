@@ -16,7 +16,7 @@ from gsstream.input.recordings.base import FilesMissing
 from gsstream.input.recordings.images import (
     PICTURE_FORMATS,
     UNDECODABLE,
-    check_unpacked,
+    check_photograph,
     is_deep,
     read_stored,
     told_apart,
@@ -109,11 +109,8 @@ def _opened(path: Path) -> tuple[tuple[int, int], bool]:
     """(width, height) of a picture, and whether it is deep."""
     try:
         with Image.open(path, formats=PICTURE_FORMATS) as image:
-            deep = is_deep(path)
-            check_unpacked(
-                path, image.width * image.height * (6 if deep else 3), "this is no photograph; export it again"
-            )
-            return image.size, deep
+            check_photograph(path, image)
+            return image.size, is_deep(path)
     except SourceError:  # is a ValueError, too
         raise
     except UNDECODABLE as error:

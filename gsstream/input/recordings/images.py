@@ -108,6 +108,12 @@ def check_unpacked(path: Path, size: int, told: str) -> None:
         raise SourceError(f"{path}: {packed} bytes unpack to {size}, more than {_PACKED} times as many: {told}")
 
 
+def check_photograph(path: Path, image: Image.Image) -> None:
+    """Raise SourceError for a picture of very many pixels in a file of very few bytes, by its header alone."""
+    size = image.width * image.height * (6 if is_deep(path) else 3)
+    check_unpacked(path, size, "this is no photograph; export it again")
+
+
 def is_deep(path: Path) -> bool:
     """Say whether an image file holds 16 bits per channel: a PNG may; all others that we read hold 8."""
     head = _head(path)
@@ -128,6 +134,7 @@ def _decode(path: Path, size: tuple[int, int], declared: str, per_pixel: int) ->
                     f"{path}: the image is {image.width} x {image.height} pixels, but {declared} {size[0]} x {size[1]};"
                     " correct the declared size (and K with it) or export the frames again"
                 )
+            check_photograph(path, image)
             require_memory(image.width * image.height * per_pixel, f"the picture {path}")
             if is_deep(path) and _head(path)[25:] == _RGB_COLOR_TYPE:
                 return _decode_rgb16(path), 65535.0

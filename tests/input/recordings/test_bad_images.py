@@ -19,6 +19,7 @@ from gsstream.core.errors import EndOfRecording, InputError, SourceError
 from gsstream.core.memory import limited_memory
 from gsstream.input.prepare.raw import find_cameras
 from gsstream.input.recordings.base import Wrapped
+from gsstream.input.recordings.images import read_image
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
 from gsstream.input.recordings.options import DataOptions
 from gsstream.input.recordings.sync import RecordingWarning
@@ -122,6 +123,19 @@ def test_first_pictures_that_are_no_photographs_are_refused_by_their_headers(tmp
     for path in tmp_path.glob("*/*.png"):
         path.write_bytes(path.read_bytes() + bytes(750_000))
     assert [camera.size for camera in find_cameras(tmp_path)[0]] == [(5_000, 5_000)] * 2
+
+
+@pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
+@pytest.mark.parametrize(("depth", "size"), [(8, 75_000_000), (16, 150_000_000)])
+def test_a_size_that_is_declared_makes_no_photograph_of_a_few_bytes(depth: int, size: int, tmp_path: Path) -> None:
+    """Black pixels of a size that cameras.json declares, too, took gigabytes from half a megabyte."""
+    path = tmp_path / "000000.png"
+    header(5_000, depth, 2)(path)
+    with pytest.raises(SourceError, match=rf"000000\.png: 66 bytes unpack to {size}, more than 100 times as many"):
+        read_image(path, (5_000, 5_000), (50, 50))
+    path.write_bytes(path.read_bytes() + bytes(size // 100))
+    with pytest.raises(SourceError, match="cannot be decoded"):
+        read_image(path, (5_000, 5_000), (50, 50))
 
 
 def test_pictures_ask_how_much_memory_they_may_take() -> None:

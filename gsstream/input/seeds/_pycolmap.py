@@ -159,8 +159,9 @@ def reconstruct(folder: Path) -> None:
     if best is None:
         np.savez(folder / "apart.npz", **_matches_of(database))
         return
-    poses = {int(Path(image.name).stem): image.cam_from_world() for image in best.images.values() if image.has_pose}
-    cameras = {int(Path(image.name).stem): best.cameras[image.camera_id] for image in best.images.values()}
+    mapped = [image for _, image in sorted(best.images.items())]
+    poses = {int(Path(image.name).stem): image.cam_from_world() for image in mapped if image.has_pose}
+    cameras = {int(Path(image.name).stem): best.cameras[image.camera_id] for image in mapped}
     held_error = np.full(len(images), np.nan)
     for index in sorted(held):
         camera = next(iter(best.cameras.values())) if shared else known[index]
@@ -234,7 +235,7 @@ def _register(database: Path, images: Any, best: Any, index: int, camera: Any, r
     mine = images[index]
     with pycolmap.Database.open(database) as db:
         keypoints = np.asarray(db.read_keypoints(mine.image_id), np.float64)[:, :2]
-        for other in best.images.values():
+        for _, other in sorted(best.images.items()):
             if not db.exists_two_view_geometry(mine.image_id, other.image_id):
                 continue
             matches = np.asarray(db.read_two_view_geometry(mine.image_id, other.image_id).inlier_matches, np.int64)

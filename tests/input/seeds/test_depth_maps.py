@@ -178,6 +178,37 @@ def test_points_lie_on_the_true_surfaces_and_repeat() -> None:
     assert sfm.triangulate_points(images, cameras).xyz.tobytes() == points.xyz.tobytes()
 
 
+@pytest.mark.sfm
+@needs_pycolmap
+def test_no_number_of_threads_changes_a_bit_of_a_point(tmp_path: Path) -> None:
+    """COLMAP's threads finish pictures and pairs in any order; what comes of them is the same, of whatever stage."""
+    source = SyntheticSource.from_query("width=320&height=240&views=6")
+    sfm.write_images(tmp_path, source.frame(0).images)
+    sfm.write_rig(tmp_path, source.info.train)
+    code = (
+        "import sys, hashlib, shutil, zlib\n"
+        "from pathlib import Path\n"
+        "from gsstream.input.seeds import _features, _pycolmap\n"
+        "import numpy as np\n"
+        "here = Path(sys.argv[1])\n"
+        "for threads in map(int, sys.argv[2:]):\n"
+        "    folder = here / f'{threads}'\n"
+        "    shutil.copytree(here / 'images', folder / 'images')\n"
+        "    shutil.copy(here / 'rig.npz', folder)\n"
+        "    _features.processors = lambda: threads\n"
+        "    _pycolmap.triangulate(folder)\n"
+        "    with np.load(folder / 'points.npz') as found:\n"
+        "        sums = {name: hashlib.sha256(found[name].tobytes()).hexdigest() for name in sorted(found)}\n"
+        "    print('points', len(found.files), sums)\n"
+    )
+    command = [sys.executable, "-c", code, os.fspath(tmp_path), "1", "2", "3", "16"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    found = [line for line in done.stdout.splitlines() if line.startswith("points 7 ")]
+    assert len(found) == 4
+    assert len(set(found)) == 1
+
+
 @needs_pycolmap
 def test_linear_algebra_takes_one_thread_whatever_the_environment_says() -> None:
     """How many threads a library takes while others work is a question of timing, and last bits follow it."""

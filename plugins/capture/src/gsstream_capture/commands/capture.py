@@ -28,11 +28,15 @@ def capture(
     check: Annotated[
         bool, typer.Option("--check", help="Look at all cameras for ten seconds, and say what is found.")
     ] = False,
+    background: Annotated[
+        bool, typer.Option("--background", help="Thirty instants, and their median: the empty room.")
+    ] = False,
 ) -> None:
     """Write what live cameras see as a folder that 'gsstream run --source watch:' follows.
 
     Ctrl-C ends the capture; what is there stays a whole recording. With --raw, and a board.yaml beside the folder, it
-    says which part of each camera's picture the board has not been in.
+    says which part of each camera's picture the board has not been in. With --background it ends by itself, and beside
+    each camera's pictures is background.jpg, in which nobody is who was not in the way half of the time.
     """
     from gsstream.core.errors import InputError
     from gsstream_capture.capture import run_capture
@@ -48,9 +52,16 @@ def capture(
         return
     if out is None:
         raise InputError("expected --out DIR, a new folder for the pictures")
+    if background and (raw or seconds is not None):
+        raise InputError("--background takes thirty instants with a calibration: leave out --raw and --seconds")
     stopped = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopped.set())
+    if background:
+        from gsstream_capture.background import save_background
+
+        typer.echo(summary(save_background(found, rig.parent, out, say=_say, stopped=stopped)))
+        return
     hint = _hint(out, [camera.id for camera in found.cameras]) if raw else None
     report = run_capture(
         found, rig.parent, out, seconds=seconds, say=_say, stopped=stopped, raw=raw, look=hint.look if hint else None

@@ -1,22 +1,89 @@
 /* Decode streams that were changed at random places and signed again, so that the faults reach the decoder.
  *
- *     mutants FIRST COUNT STREAM [STREAM ...]      decode mutants FIRST to FIRST + COUNT - 1; all that is asked is that
- *                                                  no tool which watches memory and arithmetic has a word to say
- *     mutants FIRST -1 STREAM                      write mutant FIRST to standard output
+ *     mutants FIRST COUNT STREAM [STREAM ...]     decode COUNT mutants from number FIRST on, and examine each
+ *     mutants FIRST -1 STREAM                     write mutant FIRST to standard output
+ *
+ * Whatever the bytes are, frames must follow each other, hold finite values and as many rows as their nodes; frames
+ * before the first changed byte must be those of the stream; a refusal must leave the last frame as it is; and no
+ * mutant may take ten seconds of the processor. Tools that watch memory and arithmetic must have nothing to say. Compiled
+ * with -DLIBFUZZER -fsanitize=fuzzer the same is asked of inputs that libFuzzer looks for.
  */
+#define _XOPEN_SOURCE 600
 #include "../src/c/decoder.h"
 
 #include <stdio.h>
 #include <stdlib.h>
+#include <sys/time.h>
 
-static uint64_t random_state;
+enum { FRAMES = 256 };
 
-static uint32_t draw(uint32_t below)
+/* What the frames of a stream are, and where the packets of those that are played end. */
+typedef struct {
+    size_t frames, end[FRAMES];
+    char digits[FRAMES][65];
+} expected;
+
+typedef struct {
+    uint64_t frames, refused, played, without_memory;
+} counts;
+
+static void must(int holds, const char *what)
 {
-    random_state ^= random_state << 13;
-    random_state ^= random_state >> 7;
-    random_state ^= random_state << 17;
-    return (uint32_t)((random_state >> 32) % below);
+    if (!holds) {
+        fprintf(stderr, "wrong: %s\n", what);
+        abort();
+    }
+}
+
+static void examine(const gss_frame *f)
+{
+    const float *values[] = {f->means, f->quats, f->scales, f->opacities, f->sh0, f->shN};
+    const size_t widths[] = {3, 4, 3, 1, 3, 3 * (size_t)f->harmonics};
+    for (int a = 0; a < ATTRIBUTES; a++)
+        for (size_t i = 0; i < widths[a] * f->rows; i++)
+            must(isfinite(values[a][i]), "a value is not finite");
+    uint64_t rows = 0;
+    for (uint32_t node = 0; node < f->nodes; node++)
+        rows += f->node_counts[node];
+    must(rows == f->rows, "the nodes hold another number of rows");
+    for (uint32_t row = 0; f->displaced && row < f->rows; row++)
+        must(f->displaced[row] <= 1 && isfinite(f->rotations[3 * row]), "a displacement is none");
+}
+
+/* Decode all of a stream. Frames that end at or before byte same must be those of before. */
+static void decode(const uint8_t *bytes, size_t size, const expected *before, size_t same, counts *total)
+{
+    gss_stream *stream = gss_open(bytes, size, 1 << 28);
+    must(stream != NULL, "there is no memory at all");
+    int found;
+    size_t number = 0;
+    uint32_t index = 0;
+    char digits[65] = "", after[65];
+    while ((found = gss_next(stream)) == GSS_FRAME) {
+        const gss_frame *f = gss_state(stream);
+        must(number == 0 || f->frame == index + 1, "a frame does not follow the one before");
+        index = f->frame;
+        examine(f);
+        gss_hash(f, digits);
+        if (before && number < before->frames && before->end[number] <= same)
+            must(!strcmp(digits, before->digits[number]), "a frame before the change is another one");
+        number++;
+    }
+    if (before)
+        must(number >= before->frames || before->end[number] > same || found == GSS_NO_MEMORY,
+             "a sound frame is missing");
+    if (number) {
+        gss_hash(gss_state(stream), after);
+        must(!strcmp(digits, after), "a refusal changed the last frame");
+    }
+    must(gss_next(stream) == found, "the end does not stay");
+    must(found != GSS_REFUSED || (gss_error(stream)->rule[0] && gss_error(stream)->byte <= size),
+         "a refusal without its place");
+    total->frames += number;
+    total->refused += found == GSS_REFUSED;
+    total->played += found == GSS_END;
+    total->without_memory += found == GSS_NO_MEMORY;
+    gss_close(stream);
 }
 
 static void put(uint8_t *at, uint32_t value, unsigned bytes)
@@ -42,6 +109,31 @@ static void sign(uint8_t *bytes, size_t size)
         put(h + 2, gss_crc(gss_crc(0, h, 2), h + 4, 12), 2);
         at += 16 + (size_t)length;
     }
+}
+
+#ifndef LIBFUZZER
+
+static void expect(const uint8_t *bytes, size_t size, expected *out)
+{
+    out->frames = 0;
+    gss_stream *stream = gss_open(bytes, size, 0);
+    size_t end = 16;
+    while (stream && gss_next(stream) == GSS_FRAME && out->frames < FRAMES) {
+        end += 16 + (size_t)u32_at(bytes + end + 8);
+        out->end[out->frames] = end;
+        gss_hash(gss_state(stream), out->digits[out->frames++]);
+    }
+    gss_close(stream);
+}
+
+static uint64_t random_state;
+
+static uint32_t draw(uint32_t below)
+{
+    random_state ^= random_state << 13;
+    random_state ^= random_state >> 7;
+    random_state ^= random_state << 17;
+    return (uint32_t)((random_state >> 32) % below);
 }
 
 static uint8_t *mutant(const uint8_t *original, size_t size, uint64_t number)
@@ -76,46 +168,80 @@ static uint8_t *mutant(const uint8_t *original, size_t size, uint64_t number)
     return bytes;
 }
 
-static uint8_t *read_file(const char *path, size_t *size)
+typedef struct {
+    uint8_t *bytes;
+    size_t size;
+    expected plays;
+} seed;
+
+static void read_seed(const char *path, seed *out)
 {
     FILE *file = fopen(path, "rb");
-    uint8_t *bytes = malloc(1 << 20);
-    if (!file || !bytes)
+    out->bytes = malloc(1 << 20);
+    if (!file || !out->bytes)
         exit(3);
-    *size = fread(bytes, 1, 1 << 20, file);
+    out->size = fread(out->bytes, 1, 1 << 20, file);
     fclose(file);
-    return bytes;
+    expect(out->bytes, out->size, &out->plays);
 }
 
-int main(int count, char **words)
+int main(int words_count, char **words)
 {
-    if (count < 4)
+    if (words_count < 4)
         return 3;
-    uint64_t first = strtoull(words[1], NULL, 10), frames = 0, refused = 0, ended = 0, memory = 0;
+    uint64_t first = strtoull(words[1], NULL, 10), seeds = (uint64_t)words_count - 3;
     long many = strtol(words[2], NULL, 10);
+    counts total = {0, 0, 0, 0};
+    seed *all = calloc(seeds, sizeof *all);
+    if (!all)
+        return 3;
     for (uint64_t i = first; i < first + (uint64_t)(many < 0 ? 1 : many); i++) {
-        size_t size;
-        uint8_t *original = read_file(words[3 + i % (uint64_t)(count - 3)], &size), *bytes = mutant(original, size, i);
-        free(original);
+        seed *from = all + i % seeds;
+        if (!from->bytes)
+            read_seed(words[3 + i % seeds], from);
+        uint8_t *bytes = mutant(from->bytes, from->size, i);
         if (many < 0) {
-            fwrite(bytes, 1, size, stdout);
-            free(bytes);
-            return 0;
+            fwrite(bytes, 1, from->size, stdout);
+        } else {
+            struct itimerval most = {{0, 0}, {10, 0}};
+            setitimer(ITIMER_PROF, &most, NULL); /* whoever is late ends by SIGPROF */
+            fprintf(stderr, "\rmutant %llu ", (unsigned long long)i);
+            size_t same = 0;
+            while (same < from->size && bytes[same] == from->bytes[same])
+                same++;
+            decode(bytes, from->size, &from->plays, same, &total);
         }
-        gss_stream *stream = gss_open(bytes, size, 1 << 28);
-        int found;
-        while ((found = gss_next(stream)) == GSS_FRAME) {
-            char digits[65];
-            gss_hash(gss_state(stream), digits);
-            frames++;
-        }
-        refused += found == GSS_REFUSED;
-        ended += found == GSS_END;
-        memory += found == GSS_NO_MEMORY;
-        gss_close(stream);
         free(bytes);
     }
-    printf("%llu frames, %llu refused, %llu played, %llu without memory\n", (unsigned long long)frames,
-           (unsigned long long)refused, (unsigned long long)ended, (unsigned long long)memory);
+    for (uint64_t i = 0; i < seeds; i++)
+        free(all[i].bytes);
+    free(all);
+    if (many >= 0)
+        printf("%llu frames, %llu refused, %llu played, %llu without memory\n", (unsigned long long)total.frames,
+               (unsigned long long)total.refused, (unsigned long long)total.played,
+               (unsigned long long)total.without_memory);
     return 0;
 }
+
+#else
+
+int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t size);
+size_t LLVMFuzzerCustomMutator(uint8_t *bytes, size_t size, size_t room, unsigned seed);
+size_t LLVMFuzzerMutate(uint8_t *bytes, size_t size, size_t room);
+
+int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t size)
+{
+    static counts total;
+    decode(bytes, size, NULL, 0, &total);
+    return 0;
+}
+
+size_t LLVMFuzzerCustomMutator(uint8_t *bytes, size_t size, size_t room, unsigned seed)
+{
+    size = LLVMFuzzerMutate(bytes, size, room);
+    if (seed % 16)
+        sign(bytes, size);
+    return size;
+}
+
+#endif

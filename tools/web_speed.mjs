@@ -12,6 +12,7 @@ import "../gsstream/web/layers.js";
 import { viewsOf } from "../gsstream/web/camera.js";
 import { KIND, KIND_NAMES } from "../gsstream/web/container.js";
 import { decodePacket } from "../gsstream/web/decode.js";
+import "../gsstream/web/layers.js";
 import { DepthSorter } from "../gsstream/web/sorting.js";
 import { PacketWalker } from "../gsstream/web/walker.js";
 

@@ -1,4 +1,4 @@
-"""Hold the browser's decoder against Python's on damaged and lying streams.
+"""Hold the browser's decoder, and that in C where there is a compiler, against Python's on damaged and lying streams.
 
 Usage: python tests/web/decoder_fuzz.py --count 20000 --seed 1
 
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "packet"))
+sys.path.insert(0, str(Path(__file__).parents[2]))
 from fuzz_cases import Base, bases, mutate
 from moving_scenes import moving_packets
 from node_runs import play_in_node
@@ -27,6 +28,8 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.packet import first_layer
 from gsstream.packet.base import FILE_HEADER, file_header
 from gsstream.player.playback import Playback
+from tools.decoder_in_c import Library, compiler
+from tools.decoder_in_c import play as play_in_c
 
 SECONDS = 5.0
 #: What Python says of a meta that the browser reads only in part.
@@ -93,12 +96,24 @@ def disagreement(ours: Outcome, theirs: dict[str, Any], size: int) -> str | None
     return None
 
 
+def in_c(library: Library, data: bytes, ours: Outcome, theirs: dict[str, Any]) -> str | None:
+    """Why the decoder in C goes with neither Python nor the browser; None where it does."""
+    digests, fault = play_in_c(library, data, MEGABYTES << 20)
+    said = None if fault is None else {"message": fault.message, "offset": fault.byte, "expected": bool(fault.rule)}
+    if fault is not None and theirs["error"] and FAULTY_FRAME in theirs["error"]["message"]:
+        said = theirs["error"]  # both read the format's meta to the letter, which nobody has to
+    found = {"digests": digests, "error": said, "milliseconds": 0, "early": ours.early}
+    why = disagreement(ours, found, len(data))
+    return why and f"C: {why}"
+
+
 def fuzz(count: int, seed: int, *, first: int = 0, chunk: int = 2000) -> tuple[Counter[str], list[str]]:
     """Outcomes by kind of mutation, and what went wrong."""
     corpus = [*bases(), *(_moving(seed) for seed in (1, 2, 3))]
     outcomes: Counter[str] = Counter()
     failures: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
+        library = Library(Path(folder)) if compiler() else None
         for start in range(first, first + count, chunk):
             numbers = range(start, min(start + chunk, first + count))
             cases = [mutate(corpus, seed, number) for number in numbers]
@@ -106,7 +121,10 @@ def fuzz(count: int, seed: int, *, first: int = 0, chunk: int = 2000) -> tuple[C
             if found["megabytes"] > MEGABYTES:
                 failures.append(f"cases from {start}: {found['megabytes']:.0f} MB")
             for number, (kind, data, _), theirs in zip(numbers, cases, found["streams"], strict=True):
-                why = disagreement(play_in_python(Path(folder) / "s.gss", data), theirs, len(data))
+                ours = play_in_python(Path(folder) / "s.gss", data)
+                why = disagreement(ours, theirs, len(data))
+                if why is None and library is not None:
+                    why = in_c(library, data, ours, theirs)
                 outcomes[f"{kind}: {'refused' if theirs['error'] else 'played'}"] += 1
                 if why is not None:
                     failures.append(f"case {number} ({kind}): {why}")

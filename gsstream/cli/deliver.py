@@ -17,8 +17,8 @@ def export(
     stream: Stream,
     out: Annotated[Path, typer.Option("--out", help="Folder for the files.")],
     kind: Annotated[
-        Literal["ply", "spz", "sequence", "manifest", "page"],
-        typer.Option("--format", help="3DGS PLYs, SPZs, PLYs with a list, or for the web."),
+        Literal["ply", "spz", "glb", "sequence", "usd", "4dgs", "manifest", "page"],
+        typer.Option("--format", help="PLYs, SPZs, GLBs, PLYs with a list; one file of OpenUSD or 4dgs; for the web."),
     ] = "ply",
     frames: Frames = None,
     max_memory: MaxMemory = None,
@@ -45,8 +45,7 @@ def export(
     (stream.json) holds no frame: it lists the byte ranges of all packets, so that any static web server can serve the
     stream.
     """
-    first, last = frame_range(frames)
-    most = size_of(max_memory)
+    first, last, most = *frame_range(frames), size_of(max_memory)
     file = stream_file(stream)
     if kind == "page":
         if frames is not None:
@@ -64,8 +63,9 @@ def export(
 
     with Playback(file, max_memory=most) as playback:
         chosen, damage = playback.sound(first, last)
+    tell = progress_on("frame")
     written = export_stream(
-        file, out, kind, frames=chosen, progress=progress_on("frame"), max_memory=most, origin=origin
+        file, out, kind, frames=chosen, progress=tell, max_memory=most, origin=origin, said=typer.echo
     )
     size = sum(path.stat().st_size for path in written)
     typer.echo(f"{out}: {plural(len(written), 'file')}, {size / 1e6:.1f} MB")

@@ -1,10 +1,10 @@
-"""Export decoded frames to files that other programs open: 3DGS PLY, SPZ, or a sequence with a description."""
+"""Export decoded frames to files that other programs open: 3DGS PLY, SPZ, glTF, OpenUSD, 4dgs."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -12,12 +12,28 @@ from typing import Literal
 import numpy as np
 
 from gsstream.core.errors import InputError, OutputError
-from gsstream.core.world import IDENTITY, World
+from gsstream.core.gaussians import Gaussians
+from gsstream.core.memory import limited_memory
+from gsstream.core.shapes import FloatArray, IntArray
+from gsstream.core.world import IDENTITY, World, rig_similarity
+from gsstream.player.activated import Activated, activated
+from gsstream.player.four_dgs import require_fourdgs, write_4dgs
+from gsstream.player.glb import AXES, glb_bytes
 from gsstream.player.playback import Playback
 from gsstream.player.ply import write_ply
+from gsstream.player.rows import tracked
 from gsstream.player.spz import spz_bytes
+from gsstream.player.usd import require_usd, write_usd
 
-FORMATS = ("ply", "spz", "sequence")
+#: Formats of one file per frame -> suffix; a sequence has a description beside the PLYs.
+PER_FRAME = {"ply": ".ply", "spz": ".spz", "glb": ".glb", "sequence": ".ply"}
+#: Formats of one file for all frames -> name of the file.
+WHOLE = {"usd": "stream.usdc", "4dgs": "stream.4dgs"}
+FORMATS = (*PER_FRAME, *WHOLE)
+#: From axes forward, left, up to those that a format prescribes; other formats hold those of the recording.
+UPRIGHT = {"glb": AXES, "usd": np.eye(3), "4dgs": np.eye(3)}
+#: Endings of files that somebody may take ``out`` to be.
+_SUFFIXES = (".ply", ".spz", ".glb", ".json", ".usd", ".usda", ".usdc", ".4dgs")
 
 
 def export(
@@ -29,48 +45,47 @@ def export(
     progress: Callable[[int, int], None] | None = None,
     max_memory: int | None = None,
     origin: Literal["recording", "local"] = "recording",
+    said: Callable[[str], None] | None = None,
 ) -> list[Path]:
-    """Write one file per frame into the folder ``out``; returns the files.
+    """Write one file per frame, or one for all, into the folder ``out``; returns the files.
 
     Arguments:
         stream: file to read.
         out: folder to write.
-        progress: called with (files written, files in all).
-        kind: ``ply``; ``spz``; ``sequence``: PLYs and ``sequence.json`` with frame indices, times and the cameras.
+        progress: called with (frames written, frames in all).
+        kind: ``ply``; ``spz``; ``glb``: binary glTF; ``sequence``: PLYs and ``sequence.json`` with frame indices,
+            times and the cameras; ``usd`` and ``4dgs``: one file, whose frames must be in order of time.
         frames: frame indices; default: all up to the first damaged packet.
-        max_memory: bytes that decoding a frame may take at most; default: what the format allows.
+        max_memory: bytes that a frame, or a file of many, may take at most; default: see ``gsstream.core.memory``.
         origin: ``recording``: the recording's coordinates; ``local``: the same axes and unit, but positions relative
-            to the world's offset, which ``sequence.json`` and the headers of the PLYs state. The files hold float32,
-            which is too coarse for a scene far from the recording's origin.
+            to the world's offset, which files state. The files hold float32, which is too coarse for a scene far from
+            the recording's origin. Formats that say which way is up are turned so that it is, about the same origin.
+        said: called with sentences about the size of a file before it is written, and about what is lost.
 
-    Raises InputError for an unknown format or frame, for what the format cannot hold and beyond ``max_memory``,
-    PacketError for a damaged stream (without ``frames``: once the files before the damage are written), OutputError
-    when the folder cannot be written.
+    Raises InputError for an unknown format or frame, for what the format cannot hold, for a package that is
+    missing and beyond ``max_memory``, PacketError for a damaged stream (without ``frames``: once the files before the
+    damage are written), OutputError when the folder cannot be written.
     """
-    if kind not in FORMATS:
-        raise InputError(f"cannot export to {kind!r}: expected one of {', '.join(FORMATS)}")
-    if Path(out).suffix.lower() in (".ply", ".spz", ".json") and not Path(out).is_dir():
-        raise OutputError(f"{out}: expected a folder, which holds one file per frame, got the name of a file")
-    folder, written = Path(out), []
-    with Playback(stream, max_memory=max_memory) as playback:
+    _check(kind, Path(out))
+    folder = Path(out)
+    with limited_memory(max_memory), Playback(stream) as playback:
         sound, damage = playback.sound() if frames is None else (frames, None)
         chosen = list(sound)
         for frame in chosen:
             playback.entry(frame)
-        world = _world_of_files(playback, chosen, origin)
-        comments = [f"offset {' '.join(map(repr, playback.meta.world.offset))}"] if origin == "local" else []
+        world = _world_of_files(playback, chosen, kind, origin)
+        tell = progress or _quiet
+        files = [f"{frame:06d}{PER_FRAME[kind]}" for frame in chosen] if kind in PER_FRAME else [WHOLE[kind]]
+        written = [folder / name for name in files]
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            for done, frame in enumerate(chosen, 1):
-                file = folder / f"{frame:06d}.{'spz' if kind == 'spz' else 'ply'}"
-                scene = world.gaussians(playback.state_at(frame))
-                if kind == "spz":
-                    file.write_bytes(spz_bytes(scene))
-                else:
-                    write_ply(file, scene, comments)
-                written.append(file)
-                if progress is not None:
-                    progress(done, len(chosen))
+            if kind in WHOLE:
+                _write_whole(playback, chosen, world, written[0], said or _quiet, tell)
+            else:
+                write = _writer(kind, playback.meta.world, world, origin)
+                for done, (frame, file) in enumerate(zip(chosen, written, strict=True), 1):
+                    write(file, world.gaussians(playback.state_at(frame)))
+                    tell(done, len(chosen))
             if kind == "sequence":
                 (folder / "sequence.json").write_text(_description(playback, chosen, world), encoding="utf-8")
         except OSError as error:
@@ -80,9 +95,81 @@ def export(
     return written
 
 
-def _world_of_files(playback: Playback, frames: Sequence[int], origin: str) -> World:
+def _check(kind: str, out: Path) -> None:
+    """Raise InputError for a format that is not known or lacks its package, OutputError for the name of a file."""
+    if kind not in FORMATS:
+        raise InputError(f"cannot export to {kind!r}: expected one of {', '.join(FORMATS)}")
+    if out.suffix.lower() in _SUFFIXES and not out.is_dir():
+        raise OutputError(f"{out}: expected a folder for the files, got the name of a file")
+    if kind == "usd":
+        require_usd()
+    elif kind == "4dgs":
+        require_fourdgs()
+
+
+def _writer(kind: str, recording: World, world: World, origin: str) -> Callable[[Path, Gaussians[FloatArray]], None]:
+    """Return what writes a scene, in the coordinates of ``world``, to a file of its own."""
+    if kind == "spz":
+        return lambda path, scene: _write(path, spz_bytes(scene))
+    if kind == "glb":
+        back = _back(recording, world)
+        return lambda path, scene: _write(path, glb_bytes(activated(scene), back))
+    comments = [f"offset {' '.join(map(repr, recording.offset))}"] if origin == "local" else []
+    return lambda path, scene: write_ply(path, scene, comments)
+
+
+def _back(recording: World, world: World) -> FloatArray:
+    """[4, 4] from the coordinates of a file to those of the recording."""
+    back, matrix = recording.after(world.inverse()), np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = back.scale * back.matrix, back.offset
+    return matrix
+
+
+def _quiet(*_: object) -> None:
+    """Tell nobody."""
+
+
+def _write(path: Path, data: bytes) -> None:
+    path.write_bytes(data)
+
+
+def _write_whole(
+    playback: Playback,
+    frames: Sequence[int],
+    world: World,
+    path: Path,
+    said: Callable[[str], None],
+    progress: Callable[[int, int], None],
+) -> None:
+    """Write a file of all frames; its format is that of its name."""
+    fps, back = playback.meta.fps, _back(playback.meta.world, world)
+    if not frames or list(frames) != sorted(set(frames)):
+        raise InputError(f"{path.name} holds many frames: expected one or more in order of time, got {list(frames)}")
+    if path.name == WHOLE["usd"]:
+
+        def scene_at(frame: int) -> Activated:
+            return activated(world.gaussians(playback.state_at(frame)))
+
+        write_usd(path, frames, scene_at, fps=fps, to_recording=back, said=said, progress=progress)
+        return
+
+    def scenes() -> Iterator[tuple[Activated, IntArray]]:
+        for done, (_, scene, source) in enumerate(tracked(playback, frames), 1):
+            yield activated(world.gaussians(scene)), source
+            progress(done, len(frames))
+
+    times = (np.array([*frames, frames[-1] + 1], np.float64) - frames[0]) / fps
+    write_4dgs(path, scenes(), times, to_recording=back, said=said)
+
+
+def _world_of_files(playback: Playback, frames: Sequence[int], kind: str, origin: str) -> World:
     """The world that files are written in. Raises InputError where float32 would round positions visibly."""
     world = playback.meta.world
+    if kind in UPRIGHT:
+        # A stream's own axes are forward, left, up, unless it keeps those of its recording.
+        axes = rig_similarity(playback.meta.train).matrix if world.is_identity else np.eye(3)
+        turn = UPRIGHT[kind] @ axes.T @ world.matrix.T
+        world = World(tuple(turn.ravel().tolist())).after(world)
     if origin == "local":
         return replace(world, offset=IDENTITY.offset)
     if origin != "recording":

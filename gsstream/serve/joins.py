@@ -14,24 +14,12 @@ from typing import Any
 import numpy as np
 import zstandard
 
-from gsstream.core.changes import gather_rows
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.packet import PlayerState
 
 MAGIC = b"GSSJ"
 VERSION = 1
 _LEVEL = 15
-
-
-def track_rows(source: IntArray, state: PlayerState) -> IntArray:
-    """Return [N'] int64: which row of the key packet each row is after the packet that led to ``state``; -1 is none."""
-    if state.delta is None or not state.delta.has_row_edit:
-        return source
-    assert state.before is not None
-    added = state.delta.added
-    gathered = gather_rows(state.before.node_of, added, state.delta.removed)
-    none = np.full(0 if added is None else len(added), -1, np.int64)
-    return np.concatenate([source, none])[gathered]
 
 
 def encode_join(key: PlayerState, state: PlayerState, source: IntArray) -> bytes:

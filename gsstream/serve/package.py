@@ -24,7 +24,8 @@ from gsstream.packet import FORMAT_VERSION, Entry, PacketKind, StreamReader, dec
 from gsstream.packet.base import file_header
 from gsstream.player.playback import Playback
 from gsstream.player.render import render, to_bytes
-from gsstream.serve.joins import encode_join, track_rows
+from gsstream.player.rows import track_rows
+from gsstream.serve.joins import encode_join
 
 MANIFEST, POSTER = "stream.json", "poster.jpg"
 SEGMENTS = "segments"

@@ -93,8 +93,8 @@ def test_sequence_names_files_times_and_cameras(tmp_path):
 
 def test_mistakes_of_an_export_are_named(tmp_path):
     stream = make_stream(tmp_path / "s.gss", 2)
-    with pytest.raises(InputError, match="expected one of ply, spz, sequence"):
-        export(stream, tmp_path / "out", "glb")
+    with pytest.raises(InputError, match="expected one of ply, spz, glb, sequence, usd, 4dgs"):
+        export(stream, tmp_path / "out", "obj")
     with pytest.raises(InputError, match="frame 2"):
         export(stream, tmp_path / "out", "ply", frames=[2])
     assert not (tmp_path / "out").exists()

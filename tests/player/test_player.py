@@ -46,10 +46,10 @@ def look_at(centers, target=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0), near=0.01):
 ARC = [(3 * np.cos(a), 3 * np.sin(a), 1.0) for a in (-0.6, -0.2, 0.2, 0.6)]
 
 
-def make_stream(path, frames=5, world=IDENTITY):
+def make_stream(path, frames=5, world=IDENTITY, scene=None):
     rng, rig = np.random.default_rng(1), look_at(ARC)
     meta = StreamMeta("dense", "test", {}, rig.select([0, 1, 2]), rig.select([3]), 25.0, (0.1, 0.2, 0.3), world=world)
-    scene = make_scene()
+    scene = make_scene() if scene is None else scene
     layout = Layout(np.ones(len(scene), np.int32), np.zeros(len(scene), np.uint8), np.float32([1]))
     with StreamWriter.open(path) as writer:
         writer.append(encode_key(KeyState(scene, layout, meta)))

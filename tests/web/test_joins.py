@@ -17,7 +17,8 @@ from node_runs import HERE, NODE, needs_node, node
 from gsstream.core.changes import AddedGaussians, Delta, Motion, RowEdit, groups_for
 from gsstream.core.errors import PacketError
 from gsstream.packet import PlayerState, decode_packet, encode_delta
-from gsstream.serve.joins import encode_join, track_rows
+from gsstream.player.rows import track_rows
+from gsstream.serve.joins import encode_join
 
 
 def digest(state: PlayerState) -> str:

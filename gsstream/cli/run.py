@@ -32,7 +32,9 @@ SUGGESTED = ("s2gs-fast", "queen")
 
 @grouped
 def run(
-    source: Annotated[str, typer.Option("--source", help="demo, synthetic:K=V&..., watch:DIR, DIR, or LAYOUT:DIR.")],
+    source: Annotated[
+        str, typer.Option("--source", help="demo, synthetic:K=V&..., watch:DIR, DIR, LAYOUT:DIR, s3://BUCKET/DIR.")
+    ],
     out: options.Out,
     recipe: options.RecipeOptions,
     shown: options.ShownOptions,

@@ -117,10 +117,11 @@ def named_recording(file: Path, meta: StreamMeta, catalog: Catalog) -> str:
     """Return the recording that a stream was made from, if a file from a stranger may choose this recording.
 
     A stream says which recording that was and, but for the demo and synthetic scenes, not where it lies: this stands in
-    recording.txt of the run's folder. What waits (watch:) or is opened by a plugin is only opened when the user names
-    it. Raises InputError.
+    recording.txt of the run's folder. What waits (watch:), is fetched from an address or is opened by a plugin is only
+    opened when the user names it. Raises InputError.
     """
     from gsstream.input.recordings.origin import RECORDING, public_uri, read_recording
+    from gsstream.store.address import SCHEMES
 
     said = str(meta.extra.get("source_uri", ""))
     if said == "demo" or said.startswith("synthetic:"):
@@ -135,7 +136,7 @@ def named_recording(file: Path, meta: StreamMeta, catalog: Catalog) -> str:
         )
     for scheme in beside.split(":")[:-1]:
         entry = catalog.entries.get(("source", scheme))
-        if scheme == "watch" or (entry is not None and entry.plugin != "builtin"):
+        if scheme in ("watch", *SCHEMES) or (entry is not None and entry.plugin != "builtin"):
             raise InputError(
                 f"{file} was made from {beside[:200]!r}, by {RECORDING} beside it, which is not opened because a file "
                 "says so; if you trust it, name it yourself with --source"

@@ -14,8 +14,9 @@ from gsstream.core.progress import ProgressDisplay
 def working(what: str, quiet: bool = False) -> Iterator[ProgressDisplay]:
     """Show the work of a command; Ctrl-C, SIGTERM and SIGHUP end the command at once and remove its temporary files."""
     from gsstream.engine.run.output import ended_by_signals
+    from gsstream.store.fetch import told_to
 
-    with ended_by_signals() as came, ProgressDisplay(quiet) as display:
+    with ended_by_signals() as came, ProgressDisplay(quiet) as display, told_to(display.tell):
         display.tell(what)
         try:
             yield display

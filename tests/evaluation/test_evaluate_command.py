@@ -32,10 +32,12 @@ def test_a_stream_whose_recipe_is_empty_is_compared_like_others(tmp_path, capsys
     assert "the recording does not fit the stream" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    "uri", ["watch:DIR?timeout=86400", "disturbed:gain=2:watch:DIR", "watch:", "disturbed::watch:x"]
-)
-def test_a_file_of_a_run_cannot_make_it_wait(uri, tmp_path, capsys) -> None:
+WAITING = ["watch:DIR?timeout=86400", "disturbed:gain=2:watch:DIR", "watch:", "disturbed::watch:x"]
+FETCHED = ["s3://bucket/take", "folder:https://127.0.0.1:1/take", "http://127.0.0.1:1/take"]
+
+
+@pytest.mark.parametrize("uri", WAITING + FETCHED)
+def test_a_file_of_a_run_cannot_make_it_wait_or_ask_the_network(uri, tmp_path, capsys) -> None:
     path = hostile_stream(tmp_path / "stream.gss", extra={"source_uri": uri})
     (tmp_path / "recording.txt").write_text(uri.replace("DIR", str(tmp_path)))
     assert run_command(["evaluate", str(path)]) == 2

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gsstream.core.errors import SourceError
 from gsstream.core.install_hints import install_part
-from gsstream.input.recordings.base import Source
+from gsstream.input.recordings.base import Source, Wrapped
 from gsstream.input.recordings.detect import LAYOUTS, detect, reader
 from gsstream.input.recordings.recorded import RecordedSource, Recording
+from gsstream.store.address import is_address
+
+if TYPE_CHECKING:
+    from gsstream.store.fetch import Fetched
 
 DEMO_FOLDER = Path(__file__).parent / "demo" / "pickblocks_tiny_160"
 _KNOWN = (
     "'demo' (a small recording inside the package), "
     "'synthetic:' with options such as 'synthetic:frames=40&views=8' (an analytic scene of any length), "
     "'watch:DIR' (a folder that is still being written), "
-    f"or the path of a folder, read by its layout or as you say: {':DIR, '.join(LAYOUTS)}:DIR"
+    f"or the path of a folder, read by its layout or as you say: {':DIR, '.join(LAYOUTS)}:DIR; in place of DIR, "
+    "s3://BUCKET/DIR, gs://BUCKET/DIR or https://SERVER/DIR"
 )
 
 
@@ -34,6 +40,8 @@ def open_source(uri: str, scale: float = 1.0) -> Source:
 
         return WatchSource.from_query(rest, scale=scale)
     named = scheme if separator and scheme in LAYOUTS else None
+    if is_address(rest if named else uri):
+        return _fetched(rest if named else uri, named, scale, uri)
     folder = Path(rest if named else uri)
     # Path takes an empty text for the current folder, which is never what was meant.
     if not (uri and _exists(folder)) and not named:
@@ -43,6 +51,32 @@ def open_source(uri: str, scale: float = 1.0) -> Source:
     if named == "nerfstudio" and not _exists(folder):
         return _nerfstudio(rest, scale, uri)
     return RecordedSource(read_layout(named or detect(folder), folder), scale=scale, uri=uri)
+
+
+def _fetched(address: str, named: str | None, scale: float, uri: str) -> Source:
+    """A recording of a store, from the copy in the cache."""
+    from gsstream.store.fetch import fetched
+
+    copy = fetched(address)
+    try:
+        recording = read_layout(named or detect(copy.folder), copy.folder)
+        return _FetchedSource(RecordedSource(recording, scale=scale, uri=uri), copy)
+    except BaseException:
+        copy.close()
+        raise
+
+
+class _FetchedSource(Wrapped):
+    """A recording whose files stay in the cache for as long as it is open."""
+
+    def __init__(self, source: Source, copy: Fetched) -> None:
+        super().__init__(source)
+        self._copy = copy
+
+    def close(self) -> None:
+        """Close the recording, and let go of its files."""
+        super().close()
+        self._copy.close()
 
 
 def _nerfstudio(rest: str, scale: float, uri: str) -> Source:

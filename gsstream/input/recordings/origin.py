@@ -7,6 +7,7 @@ from pathlib import Path
 
 from gsstream.core.names import last_part
 from gsstream.input.recordings.detect import LAYOUTS
+from gsstream.store.address import is_address
 
 #: File of a run's folder that holds what ``--source`` needs to open the recording again.
 RECORDING = "recording.txt"
@@ -17,8 +18,9 @@ _LONGEST = 1 << 16
 def public_uri(uri: str) -> str:
     """Return which recording an uri means without where it lies: this is what a stream, which is published, may say.
 
-    The demo and synthetic scenes stay as they are. Of a folder the last part is left, behind the layout where one is
-    stated; of a plugin's source only its name, because what follows may be an address with a password.
+    The demo and synthetic scenes stay as they are. Of a folder, and of the address of one, the last part is left,
+    behind the layout where one is stated; of a plugin's source only its name, because what follows may be an address
+    with a password.
     """
     scheme, colon, rest = uri.partition(":")
     if uri == "demo" or (colon and scheme == "synthetic"):
@@ -28,7 +30,7 @@ def public_uri(uri: str) -> str:
     if colon and scheme in LAYOUTS:
         path, mark, query = rest.partition("?")
         return f"{scheme}:{_folder(path)}{mark}{query}"
-    if _names_a_plugin(scheme, colon):
+    if _names_a_plugin(scheme, colon) and not is_address(uri):
         return f"{scheme}:"
     return _folder(uri)
 
@@ -36,9 +38,9 @@ def public_uri(uri: str) -> str:
 def whole_uri(uri: str) -> str:
     """Return an uri that means the same recording from every folder of this machine."""
     scheme, colon, rest = uri.partition(":")
-    if colon and scheme in LAYOUTS:
+    if colon and scheme in LAYOUTS and not is_address(rest):
         return f"{scheme}:{os.path.abspath(rest)}"
-    if uri == "demo" or _names_a_plugin(scheme, colon):
+    if uri == "demo" or is_address(rest) or _names_a_plugin(scheme, colon):
         return uri
     return os.path.abspath(uri)
 

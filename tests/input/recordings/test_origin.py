@@ -41,6 +41,15 @@ def test_of_a_folder_the_last_part_is_left(shape: str, layout: str, private: tup
     assert public_uri(layout + shape.format(*private)) == f"{layout}take"
 
 
+@pytest.mark.parametrize("layout", ["", *(f"{name}:" for name in LAYOUTS)])
+@pytest.mark.parametrize("scheme", ["s3", "gs", "https", "http"])
+def test_an_address_is_named_as_its_folder_is(scheme: str, layout: str) -> None:
+    """A stream is the same whether its recording lies here or there; the run's folder says which."""
+    address = f"{layout}{scheme}://qzbucket/qzfolder/take"
+    assert public_uri(address) == public_uri(f"{layout}/home/qz/take") == f"{layout}take"
+    assert whole_uri(address) == address
+
+
 @pytest.mark.parametrize("shape", SCHEMES)
 @given(private=st.tuples(secrets, secrets))
 def test_of_what_a_plugin_opens_its_name_is_left(shape: str, private: tuple[str, str]) -> None:

@@ -9,7 +9,6 @@ from typing import Annotated
 
 import typer
 
-Out = Annotated[Path, typer.Option("--out", help="Output folder; must not hold another run.")]
 Recipes = Annotated[
     list[Path] | None,
     typer.Option(

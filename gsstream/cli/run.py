@@ -16,6 +16,7 @@ from gsstream.cli import options
 from gsstream.cli.grouped import grouped
 from gsstream.cli.listing import fitting
 from gsstream.cli.open import server_beside, serving
+from gsstream.cli.results import Results
 from gsstream.cli.streams import stream_file
 from gsstream.cli.working import working
 from gsstream.core.errors import ComponentError, GsstreamError, OutputError, RecipeError, SourceError
@@ -35,7 +36,7 @@ def run(
     source: Annotated[
         str, typer.Option("--source", help="demo, synthetic:K=V&..., watch:DIR, DIR, LAYOUT:DIR, s3://BUCKET/DIR.")
     ],
-    out: options.Out,
+    out: Annotated[str, typer.Option("--out", help="Output folder, or s3://BUCKET/DIR; must not hold another run.")],
     recipe: options.RecipeOptions,
     shown: options.ShownOptions,
     first_frame: options.FirstFrame = None,
@@ -59,9 +60,10 @@ def run(
     from gsstream.recipe.load import resolve_recipe
 
     require_encoder()
-    catalog = load_catalog()
+    catalog, results = load_catalog(), Results(out)
     resolved = resolve_recipe(recipe.method, catalog.recipe_path, recipe.recipe or (), recipe.overrides())
-    server, wanted, quiet = server_beside(out, serve), shown.wanted(), shown.quiet
+    folder, wanted, quiet = results.folder, shown.wanted(), shown.quiet
+    server = server_beside(folder, serve)
     say = _silent if quiet else _note
     with working("loading the method", quiet) as display:
         # The slow imports come last: a mistake on the command line is answered at once.
@@ -78,16 +80,21 @@ def run(
         say(assembly.note)
         _reused_lines(say, resolved.recipe, recording.info, given=recipe, catalog=catalog)
         _first_look(recording, source, quiet, again=resume)
-        with claim_output(out, resume=resume, overwrite=overwrite), ended_by_signals() as came, serving(server):
+        with (
+            results.brought(resume=resume, overwrite=overwrite, say=say),
+            claim_output(folder, resume=resume, overwrite=overwrite),
+            ended_by_signals() as came,
+            serving(server),
+        ):
             try:
-                with disk_errors(out):
-                    result = encode(assembly, recording, out, resume=resume, quiet=quiet, first_frame=first)
+                with disk_errors(folder):
+                    result = encode(assembly, recording, folder, resume=resume, quiet=quiet, first_frame=first)
             except GsstreamError as error:
-                _what_there_is(error, out, recording, wanted=wanted, quiet=quiet)
+                _what_there_is(error, folder, recording, wanted=wanted, quiet=quiet)
                 raise
             except KeyboardInterrupt:
                 raise typer.Exit(128 + came[0] if came else 130) from None
-            with disk_errors(out):
+            with disk_errors(folder):
                 _pictures(result, recording, wanted, quiet=quiet, warned=assembly.recipe.renderer.name == "reference")
     finally:
         recording.close()

@@ -42,7 +42,8 @@ def refine_first_frame(assembly: Assembly, state: StreamState, step: Step, frame
     moves what is refined.
     """
     with tools.log.phase("refine"):
-        after, before = step.state, state.refinement or start_refinement(state.player)
+        after, before = step.state, state.refinement
+        assert before is not None
         found = advance_refinement(
             assembly, before, state.player, after=after.player, frame=frame, exposure=state.exposure, rng=tools.rng
         )
@@ -50,15 +51,15 @@ def refine_first_frame(assembly: Assembly, state: StreamState, step: Step, frame
     return replace(step, state=replace(after, refinement=found))
 
 
-def runs_after_packet(stream: Stream, state: StreamState, frame: Frame) -> bool:
+def runs_after_packet(stream: Stream, refinement: Refinement, frame: Frame) -> bool:
     """Return whether a frame's iterations of the refinement may follow its packet: the last ones of all may not."""
-    made = 0 if state.refinement is None else state.refinement.iterations
-    return made + (stream.refine_iterations if frame.epoch_scale > 0 else 0) < _iterations(stream)
+    more = stream.refine_iterations if frame.epoch_scale > 0 else 0
+    return refinement.iterations + more < _iterations(stream)
 
 
-def is_refining(stream: Stream, state: StreamState) -> bool:
-    """Say whether the first frame of a stream is still to be refined: only that one has a key packet like this."""
-    return stream.refine_frames > 0 and SHOWN not in state.player.meta.extra
+def is_to_be_refined(stream: Stream, player: PlayerState) -> bool:
+    """Say whether the scene of the last key packet is to be refined: that of the first frame, where the recipe asks."""
+    return stream.refine_frames > 0 and SHOWN not in player.meta.extra
 
 
 def is_refined(stream: Stream, refinement: Refinement) -> bool:

@@ -15,7 +15,7 @@ from gsstream.core.names import without_places
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import decoded_anchors, exposure_from_meta, shell_behind
-from gsstream.engine.frame0.refine import SHOWN, advance_refinement, is_refining, start_refinement
+from gsstream.engine.frame0.refine import SHOWN, advance_refinement, is_to_be_refined, start_refinement
 from gsstream.engine.state.stream_state import Refinement, StreamState, next_state
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.method.tools import Tools
@@ -98,8 +98,7 @@ def state_after(assembly: Assembly, states: Iterable[PlayerState], rng: Rng) -> 
 
 def refinement_after(assembly: Assembly, state: StreamState, tools: Tools) -> Refinement | None:
     """Return the refinement of frame 0 at the end of the stream, recomputed from packets and images since its key."""
-    stream = assembly.recipe.stream
-    if not is_refining(stream, state) or state.player.frame == state.key_frame:
+    if not is_to_be_refined(assembly.recipe.stream, state.player):
         return None
     found: Refinement | None = None
     before = state.player

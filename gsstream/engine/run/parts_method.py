@@ -9,7 +9,7 @@ from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import begin
-from gsstream.engine.frame0.refine import is_refining, refine_first_frame, runs_after_packet
+from gsstream.engine.frame0.refine import is_to_be_refined, refine_first_frame, runs_after_packet, start_refinement
 from gsstream.engine.frame0.reuse import reuse_first_frame
 from gsstream.engine.keys.keyframes import key_packet_if_due
 from gsstream.engine.keys.resume import refinement_after, state_after
@@ -47,19 +47,22 @@ class PartsMethod(StreamingMethod[StreamState]):
 
     def begin(self, frame: Frame, tools: Tools) -> Step:
         make = begin if tools.first is None else reuse_first_frame
-        return make(self.slots, frame, tools)
+        step = make(self.slots, frame, tools)
+        if is_to_be_refined(self.slots.recipe.stream, step.state.player):
+            step = replace(step, state=replace(step.state, refinement=start_refinement(step.state.player)))
+        return step
 
     def step(self, state: StreamState, frame: Frame, tools: Tools) -> Step:
-        step, stream = frame_step(self.slots, state, frame, tools), self.slots.recipe.stream
-        if is_refining(stream, state):
-            if runs_after_packet(stream, state, frame):
+        step = frame_step(self.slots, state, frame, tools)
+        if state.refinement is not None:
+            if runs_after_packet(self.slots.recipe.stream, state.refinement, frame):
                 return step  # no key packet is due before the last iteration of the refinement
             step = refine_first_frame(self.slots, state, step, frame=frame, tools=tools)
         return key_packet_if_due(self.slots, step, frame, tools)
 
     def follow_up(self, state: StreamState, step: Step, frame: Frame, tools: Tools) -> Step:
-        stream = self.slots.recipe.stream
-        if is_refining(stream, state) and runs_after_packet(stream, state, frame):
+        refinement = state.refinement
+        if refinement is not None and runs_after_packet(self.slots.recipe.stream, refinement, frame):
             return refine_first_frame(self.slots, state, step, frame=frame, tools=tools)
         return step
 

@@ -74,8 +74,8 @@ class StreamState:
     exposure: Exposure | None = None  # colour maps of the training cameras, or None
     key_frame: int = 0  # frame of the last key packet
     shell: Shell | None = None  # the sphere behind the scene; None: the recipe asks for none
-    #: The first frame as it goes on being optimised beside the stream; None before the frame after it, from the key
-    #: packet on that brings it, and when the recipe asks for none.
+    #: The first frame as it goes on being optimised beside the stream; None from the key packet on that brings it, and
+    #: when the recipe asks for none.
     refinement: Refinement | None = None
     #: State of the motion part after the packets since the last key packet (``MotionPart.follow``).
     motion_memory: Any = None

@@ -21,7 +21,7 @@ from pydantic import BaseModel, ValidationError
 from gsstream.core.errors import InputError
 from gsstream.core.kinds import CONTRACTS
 from gsstream.core.part import Part
-from gsstream.engine.assembly.fault import line_of
+from gsstream.engine.assembly.part_in_use import line_of
 from gsstream.parts.gate.base import GateSampler
 from gsstream.testing import device as device
 from gsstream.testing.cases import EXTREMES, World, fingerprint, get_case

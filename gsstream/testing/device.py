@@ -10,7 +10,7 @@ import torch
 from gsstream.core.context import RowGradient, ScreenGradient
 from gsstream.core.deferred import deferred_checks
 from gsstream.core.part import Part
-from gsstream.engine.assembly.fault import line_of
+from gsstream.engine.assembly.part_in_use import line_of
 from gsstream.parts.render.backward import backward
 from gsstream.testing.cases import World, get_case
 from gsstream.testing.compare import all_equal

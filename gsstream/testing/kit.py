@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from gsstream.core.kinds import PART_KINDS
 from gsstream.core.part import Part
-from gsstream.engine.assembly.fault import line_of
+from gsstream.engine.assembly.part_in_use import line_of
 from gsstream.method.base import StreamingMethod
 from gsstream.spec import CommandSpec
 from gsstream.testing import method_driver

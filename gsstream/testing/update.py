@@ -74,7 +74,7 @@ def check_update_closed_loop(part: UpdateRule) -> None:
     codes = part.codes()
     latents = {
         name: codes[name].step * 3 * torch.randn(value.shape, generator=g)
-        for name, value in init_latents(part, case.gaussians).items()
+        for name, value in init_latents(part.codes(), case.gaussians).items()
     }
     code = joint_layout(codes, latents, decoders, case.gaussians)
     table = torch.cat(list(latents.values()), 1) if latents else torch.zeros(n, 0)

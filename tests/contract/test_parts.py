@@ -114,7 +114,7 @@ def transmitted(
     generator = torch.Generator().manual_seed(seed)
     latents = {
         name: 3 * rule.codes()[name].step * torch.randn(zero.shape, generator=generator)
-        for name, zero in init_latents(rule, base).items()
+        for name, zero in init_latents(rule.codes(), base).items()
     }
     decoders = rule.init_decoders(base, generator)
     gate = torch.from_numpy(gates[layout.node_of[active]].astype(np.float32)) / levels
@@ -159,13 +159,13 @@ def test_attributes_without_a_decoder_agree_to_a_rounding() -> None:
 def test_zero_latents_change_nothing() -> None:
     base = make_scene(9).map(torch.from_numpy)
     rule = Coded()
-    latents, decoders = init_latents(rule, base), rule.init_decoders(base, torch.Generator().manual_seed(0))
+    latents, decoders = init_latents(rule.codes(), base), rule.init_decoders(base, torch.Generator().manual_seed(0))
     same = train_rows(rule, base, torch.ones(9), latents, decoders, torch.ones(9))
     assert all(torch.equal(getattr(same, n), getattr(base, n)) for n in ATTRIBUTES)
 
 
 def test_latents_follow_width_and_degree() -> None:
-    latents = init_latents(Coded(), make_scene(5, bases=1).map(torch.from_numpy))
+    latents = init_latents(Coded().codes(), make_scene(5, bases=1).map(torch.from_numpy))
     assert {n: tuple(v.shape) for n, v in latents.items()} == {
         "means": (5, 3),
         "quats": (5, 6),
@@ -173,7 +173,7 @@ def test_latents_follow_width_and_degree() -> None:
         "opacities": (5, 1),
         "sh0": (5, 3),
     }
-    empty = init_latents(Coded(), make_scene(0, bases=9).map(torch.from_numpy))
+    empty = init_latents(Coded().codes(), make_scene(0, bases=9).map(torch.from_numpy))
     assert tuple(empty["shN"].shape) == (0, 4)
     decoders = Coded().init_decoders(make_scene(0, bases=9).map(torch.from_numpy), torch.Generator().manual_seed(0))
     assert tuple(decoders["shN"].shape) == (4, 24)
@@ -182,9 +182,8 @@ def test_latents_follow_width_and_degree() -> None:
 def test_every_input_of_the_residual_feels_the_loss() -> None:
     base, rule = make_scene(6).map(torch.from_numpy), Coded()
     generator = torch.Generator().manual_seed(1)
-    latents = {
-        n: (2 * torch.randn(v.shape, generator=generator)).requires_grad_() for n, v in init_latents(rule, base).items()
-    }
+    zeros = init_latents(rule.codes(), base)
+    latents = {n: (2 * torch.randn(v.shape, generator=generator)).requires_grad_() for n, v in zeros.items()}
     decoders = {n: v.requires_grad_() for n, v in rule.init_decoders(base, generator).items()}
     gates = torch.full((6,), 0.5, requires_grad=True)
     out = apply_residual(rule, base, gates, latents, decoders, torch.ones(6))
@@ -236,7 +235,7 @@ def test_written_out_gradient_equals_autograd() -> None:
 
 def test_joint_table_of_attributes_that_do_not_change() -> None:
     base = make_scene(4).map(torch.from_numpy)
-    none = joint_layout(Additive().codes(), init_latents(Additive(), base.rows(torch.arange(0))), {}, base)
+    none = joint_layout(Additive().codes(), init_latents(Additive().codes(), base.rows(torch.arange(0))), {}, base)
     assert tuple(join_features(none, base.rows(torch.arange(0))).shape) == (0, none.trained.shape[1])
     code = joint_layout(Additive().codes(), {}, {}, base)
     change = decode_joint(code, torch.zeros(4, 0), code.join_decoders({}), torch.ones(4))

@@ -24,8 +24,8 @@ from gsstream.core.errors import ComponentError
 from gsstream.core.frame import Frame
 from gsstream.core.part import unwrapped
 from gsstream.encode import Encoder, encoder_for, open_recording
-from gsstream.engine.assembly.fault import Where
 from gsstream.engine.assembly.guard import Guarded, guard
+from gsstream.engine.assembly.part_in_use import Where
 from gsstream.engine.run.run_frame import RepeatedFrameWarning
 from gsstream.engine.step import frame_step as step_module
 from gsstream.packet import decode_packet

@@ -15,10 +15,10 @@ from flow_runs import TINY, WORLD
 from gsstream.cli.main import run_command
 from gsstream.core.errors import ComponentError, GsstreamError, InputError
 from gsstream.discovery.catalog import load_catalog
-from gsstream.engine.assembly import checks as checks_module
+from gsstream.engine.assembly import part_in_use as checks_module
 from gsstream.engine.assembly.assemble import Assembly, assemble
-from gsstream.engine.assembly.checks import Checks, PartInUse, requested_checks
-from gsstream.engine.assembly.fault import Where
+from gsstream.engine.assembly.checks import Checks, requested_checks
+from gsstream.engine.assembly.part_in_use import PartInUse, Where
 from gsstream.engine.run.recording import open_recording
 from gsstream.engine.run.session import run
 from gsstream.parts.backend.base import Renderer, ScatterSession

@@ -146,7 +146,7 @@ def _change(
     decoders = rule.init_decoders(scene, g)
     latents = {
         name: torch.round(4 * torch.randn(value.shape, generator=g)) * rule.codes()[name].step
-        for name, value in init_latents(rule, scene).items()
+        for name, value in init_latents(rule.codes(), scene).items()
     }
     gates, units = torch.randint(1, 11, (len(scene),), generator=g) / 10, torch.rand(len(scene), generator=g) + 0.1
     as_kind = [{name: value.to(kind) for name, value in table.items()} for table in (latents, decoders)]

@@ -15,8 +15,8 @@ from numeric_scenes import some
 
 from gsstream.core.errors import ComponentError
 from gsstream.core.hierarchy import Hierarchy
-from gsstream.engine.assembly.checks import Checks, PartInUse
-from gsstream.engine.assembly.fault import Where
+from gsstream.engine.assembly.checks import Checks
+from gsstream.engine.assembly.part_in_use import PartInUse, Where
 from gsstream.engine.step.optimise import count_dead_gates
 from gsstream.parts.gate.always_open import AlwaysOpen
 

@@ -12,10 +12,10 @@ from gsstream.core.errors import InputError, UnknownName
 from gsstream.core.kinds import PART_KINDS
 from gsstream.core.part import Part
 from gsstream.discovery.catalog import Catalog
-from gsstream.engine.assembly.checks import Checks, PartInUse, requested_checks
+from gsstream.engine.assembly.checks import Checks, requested_checks
 from gsstream.engine.assembly.choose_renderer import Chosen, choose_renderer, construct
-from gsstream.engine.assembly.fault import Where
 from gsstream.engine.assembly.guard import guard
+from gsstream.engine.assembly.part_in_use import PartInUse, Where
 from gsstream.engine.assembly.recipe_keys import unused_keys
 from gsstream.engine.assembly.slots import SLOTS, LiveParts
 from gsstream.engine.assembly.title import title

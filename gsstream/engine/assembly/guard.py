@@ -8,9 +8,9 @@ from inspect import getattr_static
 from typing import Any, TypeVar, cast
 
 from gsstream.core.part import unwrapped
-from gsstream.engine.assembly.checks import Checks, PartInUse
-from gsstream.engine.assembly.fault import Where
+from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.assembly.output_checks import OUTPUT_CHECKS
+from gsstream.engine.assembly.part_in_use import PartInUse, Where
 from gsstream.parts.backend.change import Change
 from gsstream.parts.backend.row_optimiser import RowOptimiser
 from gsstream.parts.render.session import RenderSession

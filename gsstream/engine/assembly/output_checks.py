@@ -10,7 +10,8 @@ from typing import Any
 import torch
 
 from gsstream.core.changes import Field, Motion, RowEdit
-from gsstream.engine.assembly.checks import UNIT, Checks, PartInUse
+from gsstream.engine.assembly.checks import UNIT, Checks
+from gsstream.engine.assembly.part_in_use import PartInUse
 
 
 def _estimate(use: PartInUse, args: tuple[Any, ...], result: object) -> None:

@@ -19,7 +19,8 @@ from gsstream.core.gaussians import ATTRIBUTES, Gaussians
 from gsstream.core.picture_size import area_price, densify_factor, prune_factor
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.assembly.checks import VARIABLE, Checks, PartInUse
+from gsstream.engine.assembly.checks import VARIABLE, Checks
+from gsstream.engine.assembly.part_in_use import PartInUse
 from gsstream.engine.fit import constants
 from gsstream.engine.fit.densify import DensifyStatistics, GrowthLimits, grow_and_prune
 from gsstream.engine.fit.exposure import ExposureFit

@@ -36,7 +36,7 @@ from gsstream.parts.backend.base import Renderer
 from gsstream.parts.backend.change import Change
 from gsstream.parts.growth.none import NoGrowth
 from gsstream.parts.render.session import RenderSession
-from gsstream.parts.update.base import Scope
+from gsstream.parts.update.base import Scope, scale_steps
 
 
 def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tools) -> Step:
@@ -70,7 +70,7 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
             target=(work.everywhere() if scope is Scope.ALL else work).residual_target,
             cameras=frame.cameras,
             generator=rng.stream("frame", frame.index),
-            step_scale=budget.step_scale,
+            codes=scale_steps(assembly.update.codes(), budget.step_scale),
         )
         solution = optimise(assembly, problem, schedule)
         residual = quantise_residual(assembly, problem, solution)

@@ -36,7 +36,7 @@ from gsstream.engine.step.problem import Problem, Solution
 from gsstream.parts.gate.base import GateSampler
 from gsstream.parts.residual.layout import joint_layout
 from gsstream.parts.residual.optimiser import Iteration, ResidualEpoch
-from gsstream.parts.update.base import init_latents, scale_steps
+from gsstream.parts.update.base import init_latents
 from gsstream.recipe.model import Stream
 
 #: Rows leave only when at least a tenth of them can: each time, every view has to be frozen anew.
@@ -64,11 +64,9 @@ class _Fit:
         layout, index, device = problem.layout, problem.rows.cpu().numpy(), problem.rows.device
         self.levels = torch.from_numpy(layout.unit_of[index].astype("int64")).to(device)
         self.stages = level_schedule(assembly.recipe.stream, layout.unit_of)
-        latents = init_latents(assembly.update, problem.base)
+        latents = init_latents(problem.codes, problem.base)
         self.decoders = {name: problem.decoders[name].to(device) for name in latents if name in problem.decoders}
-        self.code = joint_layout(
-            scale_steps(assembly.update.codes(), problem.step_scale), latents, self.decoders, problem.base
-        )
+        self.code = joint_layout(problem.codes, latents, self.decoders, problem.base)
         units, matrix = torch.from_numpy(layout.units_of(index)).to(device), self.code.join_decoders(self.decoders)
         self.residual = assembly.renderer.optimiser.residual_optimiser(self.code, problem.base, units, matrix)
         self.gates = TrainedGates(

@@ -13,6 +13,7 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.parts.render.session import RenderSession
 from gsstream.parts.render.target import ViewTarget
+from gsstream.parts.residual.layout import AttributeCode
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Problem:
     target: Callable[[int], ViewTarget]  # view -> what its render is compared with in the next iteration
     cameras: Cameras  # the training cameras
     generator: torch.Generator  # of noise and of the order of views
-    step_scale: float = 1.0  # factor on the update rule's quantisation steps
+    codes: Mapping[str, AttributeCode]  # attribute -> how its residual is coded in this frame
 
 
 @dataclass(frozen=True)

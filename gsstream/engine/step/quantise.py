@@ -20,7 +20,6 @@ from gsstream.packet import EncodedPacket, PlayerState, quantise_decoders
 from gsstream.packet.changes.motion import encode_motions
 from gsstream.parts.residual.layout import AttributeCode
 from gsstream.parts.update.base import quantise_latents as residual_symbols
-from gsstream.parts.update.base import scale_steps
 
 #: Largest symbol of 32 bits that float32 represents: anything between it and 2^31 would be rounded up to 2^31.
 MAX_INT32_SYMBOL = 2.0**31 - 256
@@ -31,7 +30,7 @@ def quantise_residual(assembly: Assembly, problem: Problem, solution: Solution) 
 
     Raises ComponentError when what was learned cannot be sent: not finite, or beyond symbols of 32 bits.
     """
-    codes, layout = scale_steps(assembly.update.codes(), problem.step_scale), problem.layout
+    codes, layout = problem.codes, problem.layout
     check_solution(assembly, codes, solution)
     gates = torch.round(assembly.gate.sample(solution.logits, None) * assembly.gate.num_levels).numpy().astype(np.uint8)
     rows = solution.rows.numpy()

@@ -6,6 +6,7 @@ where an attribute has no decoder), and what changes the columns of one [A, D] t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -93,7 +94,7 @@ def joint_layout(
     at = wide = 0
     for name, value in latents.items():
         code, rows = codes[name], value.shape[1]
-        columns = _width(getattr(base, name))
+        columns = width_of(getattr(base, name))
         latent[name], feature[name] = slice(at, at + rows), slice(wide, wide + columns)
         at, wide = at + rows, wide + columns
         steps += [code.step] * rows
@@ -113,5 +114,6 @@ def joint_layout(
     )
 
 
-def _width(value: torch.Tensor) -> int:
-    return int(torch.tensor(value.shape[1:]).prod())
+def width_of(value: torch.Tensor) -> int:
+    """Return the numbers of an attribute [N, ...] of one Gaussian."""
+    return math.prod(value.shape[1:])

@@ -17,7 +17,7 @@ import torch
 from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.part import Part
-from gsstream.parts.residual.layout import AttributeCode
+from gsstream.parts.residual.layout import AttributeCode, width_of
 
 #: Largest magnitude of a symbol: up to it float32, in which symbols are decoded, represents every integer exactly.
 MAX_SYMBOL = 1 << 24
@@ -53,24 +53,20 @@ class UpdateRule(Part):
         """Return the decoder [L, D] of every attribute that has one, drawn at the key packet."""
         decoders = {}
         for name, code in self.codes().items():
-            width = _width(gaussians, name)
+            width = width_of(getattr(gaussians, name))
             if code.latent and width:
                 decoders[name] = torch.randn(code.latent, width, generator=generator) * code.decoder_std
         return decoders
 
 
-def _width(gaussians: Gaussians[torch.Tensor], name: str) -> int:
-    value: torch.Tensor = getattr(gaussians, name)
-    return int(value[0].numel()) if len(value) else int(torch.tensor(value.shape[1:]).prod())
-
-
-def init_latents(rule: UpdateRule, base: Gaussians[torch.Tensor]) -> dict[str, torch.Tensor]:
+def init_latents(codes: Mapping[str, AttributeCode], base: Gaussians[torch.Tensor]) -> dict[str, torch.Tensor]:
     """Return zero latents [A, L] for the rows of ``base``; attributes of width 0 (no higher SH) are left out."""
-    return {
-        name: base.means.new_zeros(len(base), code.latent or _width(base, name))
-        for name, code in rule.codes().items()
-        if _width(base, name)
-    }
+    latents = {}
+    for name, code in codes.items():
+        width = width_of(getattr(base, name))
+        if width:
+            latents[name] = base.means.new_zeros(len(base), code.latent or width)
+    return latents
 
 
 def scale_steps(codes: Mapping[str, AttributeCode], factor: float) -> Mapping[str, AttributeCode]:

@@ -42,7 +42,7 @@ def test_budgets_of_the_paper(name: str, epochs: int) -> None:
 class TestLatent:
     def test_sizes_are_the_released_ones(self) -> None:
         scene = gaussians(7)
-        latents = init_latents(LatentResidual(), scene)
+        latents = init_latents(LatentResidual().codes(), scene)
         assert {n: v.shape[1] for n, v in latents.items()} == {
             "means": 3,
             "quats": 6,
@@ -79,7 +79,8 @@ class TestLatent:
         scene, rule = gaussians(9), LatentResidual()
         generator = torch.Generator().manual_seed(0)
         decoders = rule.init_decoders(scene, generator)
-        latents = {n: 5 * torch.randn(v.shape, generator=generator) for n, v in init_latents(rule, scene).items()}
+        zeros = init_latents(rule.codes(), scene)
+        latents = {n: 5 * torch.randn(v.shape, generator=generator) for n, v in zeros.items()}
         gates = torch.tensor([0.0] * 5 + [1.0] * 4)
         after = train_rows(rule, scene, gates, latents, decoders, torch.ones(9))
         silent = {n: torch.zeros_like(v) for n, v in latents.items()}

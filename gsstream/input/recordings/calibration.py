@@ -25,8 +25,11 @@ SCHEMA = "opencv-multiview-1"
 #: Largest numbers of frames and cameras, and lengths of a text and of a pattern that a file may state. They are checked
 #: before any memory is allocated and any file is opened.
 MAX_FRAMES, MAX_CAMERAS, MAX_TEXT, MAX_PATTERN = 10_000_000, 10_000, 1 << 20, 1000
-#: Bytes of memory for every byte of JSON; lists of empty objects are worst.
-PER_BYTE = 30
+#: Bytes of JSON that need no picture or camera, and bytes for each of those: no program writes more.
+PLAIN, PER_NAME = 2_000_000, 4_000
+#: Bytes of memory that each of these signs of a JSON file stands for, and most of them for every byte of a large file.
+_WEIGHTS, _HEAVIEST = {b"{": 230, b'"': 25, b":": 50, b",": 8, b".": 24}, 8
+_NAMES = re.compile(rb'"file_path"|"id"|\.(?:png|jpe?g)"', re.IGNORECASE)
 CALIBRATION_FILE = "cameras.json"
 _KEYS = Keys(
     read="schema name fps frames test_cameras licence cameras",
@@ -73,8 +76,6 @@ def read_calibration(folder: Path, *, growing: bool = False, any_sizes: bool = F
     cameras = data.get("cameras")
     if not isinstance(cameras, list) or not cameras or not all(isinstance(c, dict) for c in cameras):
         raise SourceError(f"{path}: 'cameras' must be a non-empty list of objects, got {brief(cameras)}")
-    if len(cameras) > MAX_CAMERAS:
-        raise SourceError(f"{path}: expected at most {MAX_CAMERAS} cameras, got {len(cameras)}")
     check_keys(str(path), [data], _KEYS)
     check_keys(f"{path}: cameras", cameras, _CAMERA_KEYS)
     ids = [_camera_id(path, camera, index) for index, camera in enumerate(cameras)]
@@ -113,8 +114,10 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def _parse_json(path: Path, absent: str = "") -> Any:
     try:
-        require_memory(path.stat().st_size * PER_BYTE, f"reading {path}")
-        return json.loads(path.read_text(encoding="utf-8"))
+        require_memory(_HEAVIEST * path.stat().st_size, f"reading {path}")
+        data = path.read_bytes()
+        _check_weight(path, data)
+        return json.loads(data)
     except InputError:  # is a ValueError, too
         raise
     except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, numbers of thousands of digits, deep nesting
@@ -122,6 +125,19 @@ def _parse_json(path: Path, absent: str = "") -> Any:
     except OSError as error:
         told = absent if absent and isinstance(error, FileNotFoundError) else f"cannot be read: {error}"
         raise SourceError(f"{path}: {told}") from error
+
+
+def _check_weight(path: Path, data: bytes) -> None:
+    """Raise SourceError for a file that is larger than its pictures and cameras explain, before it is parsed."""
+    if (cameras := data.count(b'"w2c"')) > MAX_CAMERAS:
+        raise SourceError(f"{path}: expected at most {MAX_CAMERAS} cameras, got {cameras}")
+    most = PLAIN + PER_NAME * sum(1 for _ in _NAMES.finditer(data)) if len(data) > PLAIN else PLAIN
+    weight = sum(data.count(sign) * each for sign, each in _WEIGHTS.items())
+    if len(data) > most or (len(data) > PLAIN / 2 and weight > _HEAVIEST * len(data)):
+        raise SourceError(
+            f"{path}: {len(data)} bytes of numbers and texts that no picture and no camera needs; export the "
+            "calibration again"
+        )
 
 
 def _load_json(path: Path) -> dict[str, Any]:

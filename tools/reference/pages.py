@@ -11,7 +11,7 @@ from pathlib import Path
 from tools.reference.api import api
 from tools.reference.commands import cli, recipe
 from tools.reference.contracts import checks, hooks, parts
-from tools.reference.scenes import scene_checks
+from tools.reference.scenes import scene_checks, scene_faults
 from tools.reference.text import ROOT
 
 FOLDER = ROOT / "docs" / "reference"
@@ -24,6 +24,7 @@ PAGES = {
     "parts.md": parts,
     "recipe.md": recipe,
     "scene-checks.md": scene_checks,
+    "scene-faults.md": scene_faults,
 }
 
 

@@ -9,11 +9,10 @@ from pathlib import Path
 from gsstream.core.errors import InputError, SourceError
 from gsstream.core.shapes import FloatArray
 from gsstream.input.prepare.raw import RawCamera, beside_each_other, find_cameras
-from gsstream.input.recordings.detect import LAYOUTS, detect, layouts_of
-from gsstream.input.recordings.layouts import declared
+from gsstream.input.recordings.detect import LAYOUTS, layouts_of
 from gsstream.input.recordings.lens import Lens
-from gsstream.input.recordings.open import read_layout
-from gsstream.input.recordings.recorded import Recording, check_sizes
+from gsstream.input.recordings.open import read_recording
+from gsstream.input.recordings.recorded import checked_rig
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,23 +59,15 @@ def read_raw(source: str) -> RawRecording:
 
     Raises SourceError for anything else.
     """
-    scheme, colon, rest = source.partition(":")
-    named = scheme if colon and scheme in LAYOUTS else None
-    folder = Path(rest if named else source)
-    if folder.is_dir() and named is None:
-        named = detect(folder) if layouts_of(folder) else None
-    if named is None:
+    folder = Path(source)
+    if source.partition(":")[0] not in LAYOUTS and not (folder.is_dir() and layouts_of(folder)):
         cameras, fps = find_cameras(folder)
         return RawRecording(folder.resolve().name, cameras, None, fps)
-    recording = declared.read(folder, any_sizes=True) if named == "folder" else read_layout(named, folder)
-    return _taken(folder.resolve().name, recording)
-
-
-def _taken(title: str, recording: Recording) -> RawRecording:
-    check_sizes(recording)
-    rig, (cameras, fps) = recording.rig, beside_each_other(recording.name, recording.clips)
+    recording = read_recording(source)
+    rig, (cameras, fps) = checked_rig(recording), beside_each_other(recording.name, recording.clips)
     if len(cameras) < 2:
         raise SourceError(f"{recording.where}: cameras found: {len(cameras)}; expected at least two")
     lenses = tuple(recording.lenses.get(name, Lens("radial", ())) for name in rig.ids)
     known = GivenRig(rig.viewmats, rig.Ks, lenses, recording.test, licence=recording.licence)
+    title = recording.name if recording.folder is None else recording.folder.resolve().name
     return RawRecording(title, cameras, known, fps or recording.fps)

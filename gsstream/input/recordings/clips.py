@@ -1,11 +1,11 @@
-"""A clip: the pictures of one camera, by frame number. Here: image files; videos are in ``video``."""
+"""A clip: the pictures of one camera, by frame number. Here are image files, and the search for them and for videos."""
 
 from __future__ import annotations
 
 import itertools
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -21,6 +21,7 @@ from gsstream.input.recordings.images import (
     read_stored,
     told_apart,
 )
+from gsstream.input.recordings.video import VideoClip
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".ts")
@@ -28,6 +29,10 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".ts")
 
 class Clip(Protocol):
     """The pictures of one camera. Reading is thread-safe and repeatable bit for bit."""
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """Its pictures in order, or the video alone."""
 
     @property
     def where(self) -> str:
@@ -55,7 +60,7 @@ class Clip(Protocol):
         """
 
     def close(self) -> None:
-        """Do nothing: no file stays open between reads."""
+        """Close what stays open between reads."""
 
 
 class ImageClip:
@@ -65,41 +70,16 @@ class ImageClip:
     """
 
     def __init__(self, files: Sequence[Path], numbers: Sequence[int] | None = None) -> None:
-        self._files = tuple(files)
-        self._numbers = range(len(self._files)) if numbers is None else tuple(numbers)
+        self.files, self.num_frames, self.where = tuple(files), len(files), str(files[0].parent)
+        self.numbers: Sequence[int] = range(len(files)) if numbers is None else tuple(numbers)
         if missing := [path for path in files if not path.is_file()]:
             raise FilesMissing(
                 f"{missing[0]}: the picture is missing ({len(missing)} of {len(files)} of this camera are); restore it"
             )
-        self._size, self._deep = _opened(self._files[0])
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        """In order."""
-        return self._files
-
-    @property
-    def where(self) -> str:
-        return str(self._files[0].parent)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return self._size
-
-    @property
-    def num_frames(self) -> int:
-        return len(self._files)
-
-    @property
-    def numbers(self) -> Sequence[int]:
-        return self._numbers
-
-    @property
-    def deep(self) -> bool:
-        return self._deep
+        self.size, self.deep = _opened(files[0])
 
     def read(self, index: int, target: tuple[int, int]) -> Any:
-        return read_stored(self._files[index], self._size, target, "the first image of its camera has")
+        return read_stored(self.files[index], self.size, target, "the first image of its camera has")
 
     def close(self) -> None:
         """Do nothing: no file stays open between reads."""
@@ -160,8 +140,6 @@ def clips_in(places: Sequence[Path]) -> dict[str, Clip]:
     """
     for place in places:
         if len(videos := files_in(place, VIDEO_SUFFIXES)) > 1:
-            from gsstream.input.recordings.video import VideoClip
-
             return {name: VideoClip(path) for name, path in _by_stem(videos).items()}
     for place in places:
         if len(cameras := [path for path in folders_in(place) if images_in(path)]) > 1:
@@ -170,6 +148,26 @@ def clips_in(places: Sequence[Path]) -> dict[str, Clip]:
         if len(pictures := images_in(place)) > 1:
             return {name: ImageClip([path]) for name, path in _by_stem(pictures).items()}
     return {}
+
+
+def clip_at(place: Path) -> Clip | None:
+    """Return the pictures of a folder, or the video that is called so, whatever its suffix; None where neither is."""
+    if images_in(place):
+        return folder_clip(place)
+    videos = [path for path in files_in(place.parent, VIDEO_SUFFIXES) if path.stem == place.name]
+    return VideoClip(videos[0]) if videos else None
+
+
+def listed_clips(pictures: Mapping[str, Sequence[Path]]) -> dict[str, Clip]:
+    """Return the clips of cameras whose pictures a file lists, instant by instant.
+
+    Where the pictures of all cameras have the same ascending numbers, those count, so that a gap is seen.
+    """
+    numbers = {name: [_number(path) for path in files] for name, files in pictures.items()}
+    first = next(iter(numbers.values()), [])
+    known = [number for number in first if number is not None]
+    shared = len(known) == len(first) and known == sorted(set(known)) and all(n == first for n in numbers.values())
+    return {name: ImageClip(files, known if shared else None) for name, files in pictures.items()}
 
 
 def _by_stem(files: list[Path]) -> dict[str, Path]:

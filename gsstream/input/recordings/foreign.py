@@ -8,10 +8,12 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Any
+from xml.etree.ElementTree import ParseError
 
 import numpy as np
 
@@ -87,6 +89,19 @@ def _says(value: Any) -> bool:
 def warn(told: str) -> None:
     """Warn of something in a recording that deserves a look."""
     warnings.warn(told, RecordingWarning, stacklevel=3)
+
+
+@contextmanager
+def reading(where: Any, what: str) -> Iterator[None]:
+    """What does not parse in here is a SourceError that says where, and what was expected."""
+    try:
+        yield
+    except SourceError:  # is a ValueError, too
+        raise
+    except KeyError as error:
+        raise SourceError(f"{where}: not {what}: there is no {error}") from error
+    except (ValueError, TypeError, IndexError, OverflowError, ParseError) as error:
+        raise SourceError(f"{where}: not {what}: {error}") from error
 
 
 def left_out(where: str, why: str, names: Sequence[str], stay: int, *, what: str = "cameras") -> None:

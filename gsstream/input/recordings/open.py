@@ -42,15 +42,29 @@ def open_source(uri: str, scale: float = 1.0) -> Source:
     named = scheme if separator and scheme in LAYOUTS else None
     if is_address(rest if named else uri):
         return _fetched(rest if named else uri, named, scale, uri)
+    return RecordedSource(read_recording(uri), scale=scale, uri=uri)
+
+
+def read_recording(uri: str) -> Recording:
+    """Read a folder that is there: a path, or ``LAYOUT:DIR``; ``nerfstudio:DIR`` takes ``?missing=refuse``.
+
+    Raises SourceError for another option, for a folder of no layout or of several, and for a faulty recording.
+    """
+    scheme, separator, rest = uri.partition(":")
+    named = scheme if separator and scheme in LAYOUTS else None
     folder = Path(rest if named else uri)
     # Path takes an empty text for the current folder, which is never what was meant.
     if not (uri and _exists(folder)) and not named:
         if separator and (command := install_part("source", scheme)):
             raise SourceError(f"source {uri[:200]!r}: the source {scheme!r} comes with another distribution: {command}")
         raise SourceError(f"source {uri[:200]!r}: no such folder and no known scheme; expected {_KNOWN}")
+    options: dict[str, str] = {}
     if named == "nerfstudio" and not _exists(folder):
-        return _nerfstudio(rest, scale, uri)
-    return RecordedSource(read_layout(named or detect(folder), folder), scale=scale, uri=uri)
+        text, _, query = rest.partition("?")
+        if query not in ("", "missing=refuse", "missing=skip"):
+            raise SourceError(f"source {uri[:200]!r}: expected ?missing=skip or ?missing=refuse, got ?{query[:100]}")
+        folder, options = Path(text), {"missing": query.partition("=")[2] or "skip"}
+    return read_layout(named or detect(folder), folder, **options)
 
 
 def _fetched(address: str, named: str | None, scale: float, uri: str) -> Source:
@@ -79,18 +93,6 @@ class _FetchedSource(Wrapped):
         self._copy.close()
 
 
-def _nerfstudio(rest: str, scale: float, uri: str) -> Source:
-    """``nerfstudio:DIR?missing=refuse``. Raises SourceError for another option."""
-    from gsstream.input.recordings.layouts.nerfstudio import read
-
-    text, _, query = rest.partition("?")
-    if query not in ("", "missing=refuse", "missing=skip"):
-        raise SourceError(f"source {uri[:200]!r}: expected ?missing=skip or ?missing=refuse, got ?{query[:100]}")
-    if not Path(text).is_dir():
-        return RecordedSource(read_layout("nerfstudio", Path(text)), scale=scale, uri=uri)
-    return RecordedSource(read(Path(text), "refuse" if query.endswith("refuse") else "skip"), scale=scale, uri=uri)
-
-
 def _exists(folder: Path) -> bool:
     """Whether there is such a folder or file. Raises SourceError for a text that cannot be a path at all."""
     try:
@@ -99,9 +101,9 @@ def _exists(folder: Path) -> bool:
         raise SourceError(f"source {str(folder)[:200]!r} cannot be a path: {error}") from error
 
 
-def read_layout(name: str, folder: Path) -> Recording:
-    """Read a folder as the layout ``name``. Raises SourceError when it is none, or a faulty one."""
+def read_layout(name: str, folder: Path, **options: str) -> Recording:
+    """Read a folder as the layout ``name``, with its options. Raises SourceError when it is none, or a faulty one."""
     if not folder.is_dir():
         raise SourceError(f"{folder}: no such folder; expected {LAYOUTS[name][1]}")
-    recording: Recording = reader(name).read(folder)
+    recording: Recording = reader(name).read(folder, **options)
     return replace(recording, folder=folder)

@@ -59,7 +59,13 @@ class RecordedSource(Source):
 
     def __init__(self, recording: Recording, *, scale: float = 1.0, uri: str) -> None:
         self._recording = recording
-        rig = _checked(recording, uri)
+        rig = checked_rig(recording)
+        if len(set(recording.sizes.values())) > 1:
+            told = ", ".join(f"{name} {w} x {h}" for name, (w, h) in recording.sizes.items())
+            raise SourceError(
+                f"{recording.where}: all cameras of a rig must share one image size, got {told}; to bring pictures to "
+                f"one size: {prepare_command(uri)}"
+            )
         self._target = scaled_size((rig.width, rig.height), scale)
         self._alignment = align(recording.name, recording.clips)
         self._undistort: dict[str, Undistortion] = {}
@@ -145,8 +151,8 @@ class RecordedSource(Source):
         return replace(flat, Ks=pinholes)
 
 
-def _checked(recording: Recording, uri: str) -> Cameras:
-    """The rig, once its clips are known to fit it and each other."""
+def checked_rig(recording: Recording) -> Cameras:
+    """Return the rig, once its cameras are known to be sound and its clips to fit them. Raises SourceError."""
     rig = recording.rig
     try:
         check_camera_ids(rig.ids)
@@ -158,19 +164,6 @@ def _checked(recording: Recording, uri: str) -> Cameras:
     for name in recording.test:
         if name not in rig.ids:
             raise SourceError(f"{recording.where}: test camera {name!r} does not exist; cameras: {', '.join(rig.ids)}")
-    if len(set(recording.sizes.values())) > 1:
-        told = ", ".join(f"{name} {w} x {h}" for name, (w, h) in recording.sizes.items())
-        raise SourceError(
-            f"{recording.where}: all cameras of a rig must share one image size, got {told}; to bring pictures to one "
-            f"size: {prepare_command(uri)}"
-        )
-    check_sizes(recording)
-    return rig
-
-
-def check_sizes(recording: Recording) -> None:
-    """Raise SourceError for a clip whose pictures are not of the size that the calibration is for."""
-    rig = recording.rig
     for name, clip in recording.clips.items():
         width, height = recording.sizes.get(name, (rig.width, rig.height))
         if clip.size != (width, height):
@@ -178,3 +171,4 @@ def check_sizes(recording: Recording) -> None:
                 f"{clip.where}: pictures of camera {name!r} are {clip.size[0]} x {clip.size[1]} pixels, but "
                 f"{recording.where} is for {width} x {height}: correct the calibration, or restore the pictures"
             )
+    return rig

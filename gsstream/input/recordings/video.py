@@ -32,7 +32,7 @@ class VideoClip:
     """
 
     def __init__(self, path: Path, frames: int | None = None) -> None:
-        self._path = path
+        self._path, self.files, self.where = path, (path,), str(path)
         self._av = _load_av(path)
         self._lock = threading.Lock()
         self._container: Any = None
@@ -51,7 +51,7 @@ class VideoClip:
                 raise SourceError(f"{path}: the video holds no pictures; record or copy it again")
             self._stored = (context.width, context.height)
             require_memory(context.width * context.height * PER_AVERAGED, f"a picture of {path}")
-            self._deep = any(component.bits > 8 for component in context.format.components)
+            self.deep = any(component.bits > 8 for component in context.format.components)
         if any(pts is None for pts, *_ in table):
             raise SourceError(
                 f"{path}: pictures without time stamps; put the stream into a container: ffmpeg -i IN -c copy OUT.mp4"
@@ -60,33 +60,19 @@ class VideoClip:
             # Only a decoded picture says how the file wants to be turned.
             first = next(container.decode(container.streams[self._stream]), None)
         self._matrix = display_matrix(first)
-        self._size = self._stored[::-1] if _transposes(path, self._matrix) else self._stored
-        self._doubts = _doubts(first, others)
+        self.size = self._stored[::-1] if _transposes(path, self._matrix) else self._stored
+        #: Properties of the pictures that the file states and a run ignores, each with the remedy.
+        self.doubts = _doubts(first, others)
         self._pts = sorted(pts for pts, *_ in table)[:frames]
         if frames is not None and len(self._pts) < frames:
             raise SourceError(
                 f"{path}: {frames} frames are declared, the video holds {len(self._pts)}: lower 'frames', or leave it "
                 "out where all cameras are videos"
             )
+        self.num_frames, self.numbers = len(self._pts), range(len(self._pts))
         self._keys = sorted(
             (pts, pts if dts is None else dts) for pts, dts, key, _ in packets if key and pts is not None
         )
-
-    @property
-    def where(self) -> str:
-        return str(self._path)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return self._size
-
-    @property
-    def num_frames(self) -> int:
-        return len(self._pts)
-
-    @property
-    def numbers(self) -> range:
-        return range(len(self._pts))
 
     @property
     def fps(self) -> float:
@@ -118,15 +104,6 @@ class VideoClip:
         first = int(np.flatnonzero(np.abs(off) >= 0.5 * abs(off[worst]))[0]) if off[worst] else 0
         return first, float(off[worst])
 
-    @property
-    def doubts(self) -> tuple[str, ...]:
-        """Properties of the pictures that the file states and a run ignores, each with the remedy."""
-        return self._doubts
-
-    @property
-    def deep(self) -> bool:
-        return self._deep
-
     def read(self, index: int, target: tuple[int, int]) -> Any:
         """Decode one picture. Raises SourceError naming file and frame when the data is damaged."""
         with self._lock, self._guard(f"decoded at frame {index}"):
@@ -135,9 +112,9 @@ class VideoClip:
             except BaseException:
                 self._drop()
                 raise
-        if target == self._size and not self._deep:
+        if target == self.size and not self.deep:
             return pixels
-        return shrink(pixels, target) / np.float32(65535 if self._deep else 255)
+        return shrink(pixels, target) / np.float32(65535 if self.deep else 255)
 
     def close(self) -> None:
         with self._lock:
@@ -195,7 +172,7 @@ class VideoClip:
                 f"{display_matrix(frame)}, the first was {self._stored[0]} x {self._stored[1]}, {self._matrix}; "
                 "re-encode the video at one size"
             )
-        pixels: np.ndarray[Any, Any] = frame.to_ndarray(format="rgb48le" if self._deep else "rgb24")
+        pixels: np.ndarray[Any, Any] = frame.to_ndarray(format="rgb48le" if self.deep else "rgb24")
         return upright(pixels, self._matrix, self._path)
 
     def _drop(self) -> None:

@@ -3,9 +3,9 @@
 Of several models (sparse/0/, sparse/1/, ...) the one with the most images is read.
 
 The model's images are the cameras. A camera is named after its image's own folder (``cam00/000000.png`` -> cam00) when
-every image has one, else after the image (``cam00.png`` -> cam00). Its frames are the first of these that is there:
-``images/NAME/*.png``, ``frames/NAME/*.png``, ``videos/NAME.mp4``, ``images/NAME.mp4``, ``NAME.mp4``, and else the image
-alone: a still scene of one frame. There are no test cameras unless ``data.test_cameras`` says so.
+every image has one, else after the image (``cam00.png`` -> cam00). Its frames are the folder of pictures or
+the video of that name in the first of ``images/``, ``frames/``, ``videos/`` and the folder itself that has one; else
+they are the image alone, a still scene of one frame. There are no test cameras unless ``data.test_cameras`` says so.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import PointCloud
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, images_in, natural_sort_key
+from gsstream.input.recordings.clips import Clip, ImageClip, clip_at, natural_sort_key
 from gsstream.input.recordings.foreign import inside, left_out, warn
 from gsstream.input.recordings.layouts.colmap_model import (
     ModelImage,
@@ -30,7 +30,7 @@ from gsstream.input.recordings.layouts.colmap_model import (
 from gsstream.input.recordings.lens import from_colmap
 from gsstream.input.recordings.poses import from_quaternion
 from gsstream.input.recordings.recorded import Recording, SeenPoints
-from gsstream.input.recordings.rigs.camera import RigCamera, assembled_rig
+from gsstream.input.recordings.rigs.camera import RigCamera, assembled_rig, say_unused
 
 
 def looks_like(folder: Path) -> bool:
@@ -61,11 +61,11 @@ def read(folder: Path) -> Recording:
         camera = cameras[image.camera]
         K, lens = from_colmap(camera.model, camera.params, f"{model}: camera {image.camera}")
         pose = from_quaternion(_unit(model, image), image.translation)
-        rig[name] = RigCamera(name=name, w2c=pose, K=K, lens=lens, size=(camera.width, camera.height), border=0)
+        rig[name] = RigCamera(name=name, w2c=pose, K=K, lens=lens, size=(camera.width, camera.height), border=False)
         if (clip := _clip(folder, name, image.name)) is not None:
             clips[name] = clip
     left_out(str(model), "without pictures", [name for name in names if name not in clips], len(clips))
-    _say_unused(folder, model, [images[number].name for number in numbers], clips)
+    say_unused(model, clips)
     kept = [number for name, number in zip(names, numbers, strict=True) if name in clips]
     return assembled_rig(folder, model, rig, clips, points=lambda _: _points(model, kept))
 
@@ -82,21 +82,6 @@ def _largest(folder: Path) -> tuple[Path, dict[int, ModelImage]]:
         told = ", ".join(f"{place.relative_to(folder)} has {len(images)} images" for place, images in models.items())
         warn(f"{folder}: several models: {told}; {best.relative_to(folder)} is read: delete the others, or merge them")
     return best, models[best]
-
-
-def _say_unused(folder: Path, model: Path, images: list[str], clips: dict[str, Clip]) -> None:
-    """Warn of pictures that no camera of the model takes."""
-    taken = {PurePosixPath(name).parts[0] for name in images if "/" in name} | set(clips)
-    places = [place for place in (folder / "images", folder / "frames", folder / "videos") if place.is_dir()]
-    inside = [path for place in places for path in sorted(place.iterdir())]
-    other = [p.name for p in inside if p.is_dir() and p.name not in taken and images_in(p)]
-    other += [p.name for p in inside if p.suffix.lower() in VIDEO_SUFFIXES and p.stem not in taken]
-    # A picture beside those of the model is another view, or another instant, of which a model of frame 0 says nothing.
-    if flat := {PurePosixPath(name).name for name in images if "/" not in name}:
-        other += [p.name for p in images_in(folder / "images") if p.name not in flat]
-    if other:
-        some = ", ".join(other[:8]) + (", ..." if len(other) > 8 else "")
-        warn(f"{model}: pictures without a pose are left out: {some} ({len(other)}); {len(clips)} cameras stay")
 
 
 def _unit(model: Path, image: ModelImage) -> FloatArray:
@@ -121,15 +106,9 @@ def _names(model: Path, files: list[str]) -> list[str]:
 
 
 def _clip(folder: Path, name: str, image: str) -> Clip | None:
-    for place in (folder / "images" / name, folder / "frames" / name):
-        if images_in(place):
-            return folder_clip(place)
-    for stem in (folder / "videos" / name, folder / "images" / name, folder / name):
-        for suffix in VIDEO_SUFFIXES:
-            if (path := stem.with_name(stem.name + suffix)).is_file():
-                from gsstream.input.recordings.video import VideoClip
-
-                return VideoClip(path)
+    for place in (folder / "images", folder / "frames", folder / "videos", folder):
+        if (clip := clip_at(place / name)) is not None:
+            return clip
     path = folder / "images" / inside(str(folder), image)
     return ImageClip([path]) if path.is_file() else None
 

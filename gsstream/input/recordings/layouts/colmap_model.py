@@ -17,7 +17,7 @@ import numpy as np
 
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.foreign import MAX_SIDE
+from gsstream.input.recordings.foreign import MAX_SIDE, reading
 
 #: Number in .bin files -> name and number of parameters.
 MODELS = {
@@ -108,12 +108,12 @@ def read_cameras(folder: Path) -> dict[int, ModelCamera]:
             if model not in MODELS:
                 raise SourceError(f"{path}: camera {number} has the unknown model number {model}")
             name, size = MODELS[model]
-            with _parsing(path, number):
+            with reading(f"{path}:{number}", "a line of this file"):
                 cameras[number] = _camera(name, width, height, file.take(f"<{size}d"))
         return cameras
     sizes = dict(MODELS.values())
     for where, words in _lines(path):
-        with _parsing(path, where):
+        with reading(f"{path}:{where}", "a line of this file"):
             number, name, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
             params = tuple(float(word) for word in words[4:])
             if sizes.get(name) != len(params):
@@ -151,7 +151,7 @@ def read_images(folder: Path) -> dict[int, ModelImage]:
             continue
         words = line.split(maxsplit=9)
         after_pose = True
-        with _parsing(path, where):
+        with reading(f"{path}:{where}", "a line of this file"):
             pose = [float(word) for word in words[1:8]]
             image = ModelImage(words[9].strip(), int(words[8]), np.array(pose[:4]), np.array(pose[4:]))
             if int(words[0]) in images:
@@ -185,7 +185,7 @@ def read_points(folder: Path) -> ModelPoints:
             seen.append(file.array(_TRACK, file.count(_TRACK.itemsize))["image"])
     else:
         for where, words in _lines(path):
-            with _parsing(path, where):
+            with reading(f"{path}:{where}", "a line of this file"):
                 xyz.append([float(word) for word in words[1:4]])
                 rgb.append([int(word) for word in words[4:7]])
                 seen.append(np.array([int(word) for word in words[8::2]], np.int64))
@@ -225,17 +225,3 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     for where, line in enumerate(_text(path).split("\n"), 1):
         if line.strip() and not line.startswith("#"):
             yield where, line.split()
-
-
-class _parsing:  # noqa: N801 reads as a statement
-    """Names file and line of whatever does not parse."""
-
-    def __init__(self, path: Path, line: int) -> None:
-        self._path, self._line = path, line
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, (ValueError, IndexError, OverflowError)) and not isinstance(error, SourceError):
-            raise SourceError(f"{self._path}:{self._line}: not a line of this file: {error}") from error

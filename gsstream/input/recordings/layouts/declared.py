@@ -15,6 +15,8 @@ from gsstream.input.recordings.calibration import CALIBRATION_FILE, Calibration,
 from gsstream.input.recordings.clips import Clip, ImageClip
 from gsstream.input.recordings.pointfiles import POINTS_FILE, read_points
 from gsstream.input.recordings.recorded import Recording, SeenPoints
+from gsstream.input.recordings.rigs.camera import say_unused
+from gsstream.input.recordings.video import VideoClip
 
 
 def looks_like(folder: Path) -> bool:
@@ -22,20 +24,19 @@ def looks_like(folder: Path) -> bool:
     return (folder / CALIBRATION_FILE).is_file()
 
 
-def read(folder: Path, *, any_sizes: bool = False) -> Recording:
-    """Read the calibration and open its pictures.
-
-    Raises SourceError for a faulty calibration, for what is missing, and for cameras of several sizes.
-    """
-    known = read_calibration(folder, any_sizes=any_sizes)
+def read(folder: Path) -> Recording:
+    """Read the calibration and open its pictures. Raises SourceError for a faulty calibration and what is missing."""
+    known = read_calibration(folder, any_sizes=True)
     check_files(folder, known)
     train, test = known.train, known.test
     rig = train.joined(test)
+    clips = {name: _clip(folder, known, name) for name in rig.ids}
+    say_unused(folder / CALIBRATION_FILE, clips, flat=False)
     return Recording(
         name=known.name,
         where=str(folder / CALIBRATION_FILE),
         rig=rig,
-        clips={name: _clip(folder, known, name) for name in rig.ids},
+        clips=clips,
         test=test.ids,
         fps=known.fps,
         lenses=known.lenses,
@@ -50,8 +51,6 @@ def _clip(folder: Path, known: Calibration, name: str) -> Clip:
     if not is_video(pattern):
         numbers = frame_numbers(folder, pattern, known.num_frames)
         return ImageClip([folder / frame_path(pattern, number) for number in numbers], numbers)
-    from gsstream.input.recordings.video import VideoClip
-
     return VideoClip(folder / pattern, known.num_frames or None)
 
 

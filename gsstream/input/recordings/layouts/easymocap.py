@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gsstream.core.errors import SourceError
-from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, folder_clip, images_in
+from gsstream.input.recordings.clips import clip_at, folders_in, images_in
 from gsstream.input.recordings.foreign import Keys, check_keys, inside, left_out, pixels
 from gsstream.input.recordings.poses import from_pixel_centers, from_rotation_vector
 from gsstream.input.recordings.recorded import Recording
@@ -43,8 +43,9 @@ def read(folder: Path) -> Recording:
         inside(f"{path}: names", name)
     check_keys(str(path), [intri], _INTRI)
     check_keys(str(folder / EXTRINSICS), [extri], _EXTRI)
-    there = [p.name for p in (folder / "images").glob("*") if images_in(p)]
-    clips = {n: clip for n in sorted({*names, *there}) if (clip := _clip_of(folder, n)) is not None}
+    there = [place.name for place in folders_in(folder / "images") if images_in(place)]
+    places = {name: (folder / "images" / name, folder / "videos" / name) for name in sorted({*names, *there})}
+    clips = {name: clip for name, (a, b) in places.items() if (clip := clip_at(a) or clip_at(b)) is not None}
     if not clips:
         raise SourceError(f"{folder}: no pictures of any camera; expected images/NAME/000000.jpg or videos/NAME.mp4")
     cameras = {name: _camera(folder, intri, extri, name=name, pictures=clip.size) for name, clip in clips.items()}
@@ -54,17 +55,6 @@ def read(folder: Path) -> Recording:
     left_out(str(path), "without one of K, Rot (or R) and T", lost, len(known))
     seen = {name: clips[name] for name in known}
     return assembled_rig(folder, path, known, seen, test=(next(iter(seen)),), licence="see the data set")
-
-
-def _clip_of(folder: Path, name: str) -> Clip | None:
-    if (folder / "images" / name).is_dir():
-        return folder_clip(folder / "images" / name)
-    for suffix in VIDEO_SUFFIXES:
-        if (path := folder / "videos" / f"{name}{suffix}").is_file():
-            from gsstream.input.recordings.video import VideoClip
-
-            return VideoClip(path)
-    return None
 
 
 def _camera(
@@ -89,5 +79,5 @@ def _camera(
         K=from_pixel_centers(numbers_of(inner, intri, f"K_{name}", counts=(9,)).reshape(3, 3)),
         lens=opencv_lens(coefficients, False, f"{inner}: {bent}"),
         size=(sides[0], sides[1]) if len(sides) == 2 else pictures,
-        border=0,
+        border=False,
     )

@@ -13,16 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
-from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, ImageClip, folder_clip, images_in, natural_sort_key
+from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.poses import from_llff
 from gsstream.input.recordings.recorded import Recording
+from gsstream.input.recordings.rigs.camera import RigCamera, assembled_rig
+from gsstream.input.recordings.video import VideoClip
 
 POSES_FILE = "poses_bounds.npy"
-#: Pictures may be scaled, not cropped or squeezed.
-_ASPECT_TOLERANCE = 0.01
 
 
 def looks_like_llff(folder: Path, pattern: str) -> bool:
@@ -33,16 +33,9 @@ def looks_like_llff(folder: Path, pattern: str) -> bool:
 def read_llff(folder: Path, pattern: str) -> Recording:
     """Read a recording whose cameras are called so; the first of them is for tests."""
     clips = _camera_clips(folder, pattern)
-    names = tuple(clips)
-    rig = read_poses_bounds(folder / POSES_FILE, names, clips[names[0]].size)
-    return Recording(
-        name=folder.resolve().name,
-        where=str(folder / POSES_FILE),
-        rig=rig,
-        clips=clips,
-        test=names[:1],
-        licence="see the data set",
-    )
+    cameras = read_poses_bounds(folder / POSES_FILE, list(clips))
+    test = (next(iter(clips)),)
+    return assembled_rig(folder, folder / POSES_FILE, cameras, clips, test=test, licence="see the data set")
 
 
 def _camera_clips(folder: Path, pattern: str) -> dict[str, Clip]:
@@ -52,8 +45,6 @@ def _camera_clips(folder: Path, pattern: str) -> dict[str, Clip]:
     """
     videos = [p for p in folder.glob(pattern) if p.suffix.lower() in VIDEO_SUFFIXES]
     if videos:
-        from gsstream.input.recordings.video import VideoClip
-
         return {p.stem: VideoClip(p) for p in sorted(videos, key=natural_sort_key)}
     folders = sorted((p for p in folder.glob(pattern) if p.is_dir()), key=natural_sort_key)
     if folders:
@@ -67,20 +58,24 @@ def _camera_clips(folder: Path, pattern: str) -> dict[str, Clip]:
 
 
 def _by_instant(instants: list[Path], pattern: str) -> dict[str, Clip]:
-    first = [p for p in images_in(instants[0]) if p.match(f"{pattern}.*")]
+    there = [{path.stem: path for path in images_in(place)} for place in instants]
+    first = [path for path in there[0].values() if path.match(f"{pattern}.*")]
     if not first:
         raise SourceError(f"{instants[0]}: no pictures {pattern}.png; expected one per camera")
-    clips: dict[str, Clip] = {}
-    for picture in first:
-        clips[picture.stem] = ImageClip([instant / picture.name for instant in instants])
-    return clips
+    numbers = [int(digits) for place in instants if (digits := place.name.removeprefix("frame")).isdigit()]
+    return {
+        path.stem: ImageClip(
+            [own.get(path.stem, place / path.name) for own, place in zip(there, instants, strict=True)],
+            numbers if len(set(numbers)) == len(instants) else None,
+        )
+        for path in first
+    }
 
 
-def read_poses_bounds(path: Path, names: Sequence[str], size: tuple[int, int]) -> Cameras:
-    """Return the rig of poses_bounds.npy for pictures of ``size`` (width, height).
+def read_poses_bounds(path: Path, names: Sequence[str]) -> dict[str, RigCamera]:
+    """Return the cameras of poses_bounds.npy, whose rows belong to these names.
 
-    Raises SourceError when the file is not such an array, has another number of rows than there are cameras, or was
-    made for pictures of another shape.
+    Raises SourceError when the file is not such an array, or has another number of rows than there are cameras.
     """
     rows = _load(path)
     if len(rows) != len(names):
@@ -89,22 +84,17 @@ def read_poses_bounds(path: Path, names: Sequence[str], size: tuple[int, int]) -
             "natural order of their names: restore the missing cameras, or delete the rows of those left out"
         )
     matrices = rows[:, :15].reshape(-1, 3, 5)
-    heights, widths, focals = matrices[:, 0, 4], matrices[:, 1, 4], matrices[:, 2, 4]
-    for name, height, width, focal in zip(names, heights, widths, focals, strict=True):
+    rig: dict[str, RigCamera] = {}
+    for name, pose, (height, width, focal) in zip(names, from_llff(matrices[:, :, :4]), matrices[:, :, 4], strict=True):
         if not (height > 0 and width > 0 and focal > 0):
             raise SourceError(
                 f"{path}: camera {name!r}: expected positive height, width and focal length, got {height:g}, "
                 f"{width:g}, {focal:g}; is this the LLFF format?"
             )
-        if abs(width / height * size[1] / size[0] - 1) > _ASPECT_TOLERANCE:
-            raise SourceError(
-                f"{path}: camera {name!r} is calibrated for {width:g} x {height:g}, but the pictures are "
-                f"{size[0]} x {size[1]}, another shape; use pictures that are scaled, not cropped"
-            )
-    Ks: FloatArray = np.tile(np.eye(3), (len(rows), 1, 1))
-    Ks[:, 0, 0] = Ks[:, 1, 1] = focals * size[0] / widths
-    Ks[:, 0, 2], Ks[:, 1, 2] = size[0] / 2, size[1] / 2
-    return Cameras(tuple(names), from_llff(matrices[:, :, :4]), Ks, *size)
+        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        size = (round(float(width)), round(float(height)))
+        rig[name] = RigCamera(name=name, w2c=pose, K=K, lens=Lens("radial", ()), size=size, border=False)
+    return rig
 
 
 def _load(path: Path) -> FloatArray:

@@ -23,13 +23,14 @@ import numpy as np
 
 from gsstream.core.errors import SourceError, suggest
 from gsstream.input.recordings.calibration import read_json
-from gsstream.input.recordings.clips import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Clip, ImageClip, folder_clip
+from gsstream.input.recordings.clips import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Clip, folder_clip, listed_clips
 from gsstream.input.recordings.foreign import Keys, check_keys, inside, left_out, number, warn
 from gsstream.input.recordings.layouts.nerfstudio_camera import camera_of, pose_of
 from gsstream.input.recordings.layouts.nerfstudio_groups import INTRINSICS, group_entries
 from gsstream.input.recordings.pointfiles import read_ply_points
 from gsstream.input.recordings.recorded import Recording, SeenPoints
-from gsstream.input.recordings.rigs.camera import assembled_rig
+from gsstream.input.recordings.rigs.camera import assembled_rig, say_unused
+from gsstream.input.recordings.video import VideoClip
 
 FILE, SPLIT_FILE = "transforms.json", "transforms_{}.json"
 Missing = Literal["skip", "refuse"]
@@ -76,7 +77,8 @@ def read(folder: Path, missing: Missing = "skip") -> Recording:
             "would be shifted against each other. Restore them, or give every entry its 'time'"
         )
     groups, test = _split(path, data, groups)
-    clips = {name: _clip([files[entry["file_path"]] for entry in entries]) for name, entries in groups.items()}
+    clips = _clips({name: [files[entry["file_path"]] for entry in entries] for name, entries in groups.items()})
+    say_unused(path, clips, list(files.values()))
     cameras = {
         name: camera_of(path, {**data, **entries[0]}, name, clips[name].size) for name, entries in groups.items()
     }
@@ -213,16 +215,15 @@ def _files(folder: Path, frames: list[dict[str, Any]]) -> dict[str, Path]:
     return found
 
 
-def _clip(files: list[Path]) -> Clip:
-    if len(files) > 1:
-        return ImageClip(files)
-    if files[0].is_dir():
-        return folder_clip(files[0])
-    if files[0].suffix.lower() in VIDEO_SUFFIXES:
-        from gsstream.input.recordings.video import VideoClip
-
-        return VideoClip(files[0])
-    return ImageClip(files)
+def _clips(groups: dict[str, list[Path]]) -> dict[str, Clip]:
+    """Every camera's pictures: those that entries name one by one, a folder of them, or a video."""
+    whole: dict[str, Clip] = {
+        name: folder_clip(file) if file.is_dir() else VideoClip(file)
+        for name, (file, *others) in groups.items()
+        if not others and (file.is_dir() or file.suffix.lower() in VIDEO_SUFFIXES)
+    }
+    listed = listed_clips({name: own for name, own in groups.items() if name not in whole})
+    return {name: (whole | listed)[name] for name in groups}
 
 
 def _points(folder: Path, name: str | None, cameras: int) -> SeenPoints | None:

@@ -62,7 +62,7 @@ def camera_of(path: Path, data: dict[str, Any], name: str, pictures: tuple[int, 
         K=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]),
         lens=_lens(where, data, name),
         size=(size[0], size[1]),
-        border=0,
+        border=False,
     )
 
 

@@ -13,14 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.frame import PointCloud
 from gsstream.input.recordings.calibration import read_json
-from gsstream.input.recordings.clips import Clip, ImageClip
-from gsstream.input.recordings.foreign import Keys, check_keys, inside, matrix, pixels
+from gsstream.input.recordings.clips import listed_clips
+from gsstream.input.recordings.foreign import Keys, check_keys, inside, left_out, matrix, pixels
+from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.pointfiles import check_archive, colours
 from gsstream.input.recordings.recorded import Recording, SeenPoints
+from gsstream.input.recordings.rigs.camera import RigCamera, assembled_rig, say_unused
 
 TRAIN, TEST, IMAGES, POINTS = "train_meta.json", "test_meta.json", "ims", "init_pt_cld.npz"
 
@@ -35,37 +36,37 @@ def looks_like(folder: Path) -> bool:
 
 def read(folder: Path) -> Recording:
     """Read CMU Panoptic: 27 training cameras, 640 x 360, 150 frames; test_meta.json has the test cameras."""
-    ids: list[str] = []
-    poses, intrinsics = [], []
-    clips: dict[str, Clip] = {}
-    sizes = set()
-    test: tuple[str, ...] = ()
+    rig: dict[str, RigCamera] = {}
+    pictures: dict[str, list[Path]] = {}
+    test: list[str] = []
     for name in (TRAIN, TEST):
         path = folder / name
         if name == TEST and not path.is_file():
             continue
         meta = _load(path)
-        sizes.add((pixels(str(path), "w", meta["w"]), pixels(str(path), "h", meta["h"])))
+        size = pixels(str(path), "w", meta["w"]), pixels(str(path), "h", meta["h"])
         names = [f"cam{number}" for number in _fixed(path, meta, "cam_id")]
         files = _files(path, meta, len(names))
+        poses, Ks = (_matrices(path, meta, key, cameras=len(names), side=side) for key, side in (("w2c", 4), ("k", 3)))
         for c, camera in enumerate(names):
-            if camera in clips:
+            if camera in rig:
                 raise SourceError(f"{path}: camera {camera!r} is there twice, in {TRAIN} and {TEST} or within one")
-            clips[camera] = ImageClip([folder / IMAGES / row[c] for row in files])
-        ids += names
-        poses.append(_matrices(path, meta, "w2c", cameras=len(names), side=4))
-        intrinsics.append(_matrices(path, meta, "k", cameras=len(names), side=3))
-        test = tuple(names) if name == TEST else test
-    if len(sizes) != 1:
-        raise SourceError(f"{folder / TEST}: the size of the pictures differs from {TRAIN}: {sorted(sizes)}")
-    rig = Cameras(tuple(ids), np.concatenate(poses), np.concatenate(intrinsics), *sizes.pop())
-    return Recording(
-        name=folder.resolve().name,
-        where=str(folder / TRAIN),
-        rig=rig,
-        clips=clips,
-        test=test,
-        points=lambda _: _points(folder / POINTS, len(ids)),
+            pictures[camera] = [folder / IMAGES / row[c] for row in files]
+            rig[camera] = RigCamera(
+                name=camera, w2c=poses[c], K=Ks[c], lens=Lens("radial", ()), size=size, border=False
+            )
+        test = names if name == TEST else test
+    seen = {name: own for name, own in pictures.items() if any(path.is_file() for path in own)}
+    left_out(str(folder / TRAIN), "without pictures", [name for name in rig if name not in seen], len(seen))
+    clips = listed_clips(seen)
+    say_unused(folder / TRAIN, clips)
+    return assembled_rig(
+        folder,
+        folder / TRAIN,
+        rig,
+        clips,
+        test=tuple(name for name in test if name in seen),
+        points=lambda _: _points(folder / POINTS, len(seen)),
         licence="CMU Panoptic: research use only",
     )
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.clips import Clip
+from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, files_in, folders_in, images_in
 from gsstream.input.recordings.foreign import left_out, warn
 from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.recorded import Recording
@@ -32,7 +33,7 @@ class RigCamera:
     K: FloatArray
     lens: Lens  # how rays bend
     size: tuple[int, int] | None  # (width, height) that K is for; None: not stored
-    border: float = BORDER  # share of the size that pictures may have lost or gained without being scaled
+    border: bool = True  # whether pictures may have lost or gained a border
 
     def intrinsics(self, size: tuple[int, int]) -> FloatArray:
         """Return K for pictures of this size. Raises SourceError when they show another part of the view."""
@@ -41,10 +42,12 @@ class RigCamera:
             out[:2, 2] += np.array(size) / 2
             return out
         across, down = size[0] / self.size[0], size[1] / self.size[1]
-        if abs(across - down) < 1e-3 * down:
+        # Sides that were scaled are rounded to whole pixels; near the calibrated size, a pixel may be a border.
+        near = max(abs(across - 1), abs(down - 1)) < BORDER
+        if abs(across - down) < (1e-3 if near else 1 / min(size)) * down:
             scaled: FloatArray = np.diag([across, down, 1.0]) @ self.K
             return scaled
-        if max(abs(across - 1), abs(down - 1)) < self.border:
+        if near and self.border:
             return self.K
         raise SourceError(
             f"camera {self.name!r} is calibrated for pictures of {self.size[0]} x {self.size[1]}, but those found are "
@@ -86,6 +89,28 @@ def assembled_rig(
         sizes=sizes,
         **more,
     )
+
+
+def say_unused(where: Path, clips: Mapping[str, Clip], named: Collection[Path] = (), *, flat: bool = True) -> None:
+    """Warn of pictures and videos beside those of these cameras that no camera has.
+
+    ``named``: those of which something was said already. ``flat``: look into folders that cameras share, too.
+    """
+    used = {path for clip in clips.values() for path in clip.files} | set(named)
+    homes = Counter(place for clip in clips.values() for place in {path.parent for path in clip.files})
+    films = {path.parent for path in used if path.suffix.lower() in VIDEO_SUFFIXES}
+    found: list[Path] = []
+    for place, shared in homes.items():
+        if place in films:
+            found += files_in(place, VIDEO_SUFFIXES)
+        elif shared == 1 and len(clips) > 1:
+            found += [folder for folder in folders_in(place.parent) if images_in(folder)]
+        elif flat:
+            found += images_in(place)
+    known = used | {path.parent for path in used}
+    if other := list(dict.fromkeys(path.name for path in found if path not in known)):
+        some = ", ".join(other[:8]) + (", ..." if len(other) > 8 else "")
+        warn(f"{where}: pictures without a pose are left out: {some} ({len(other)}); {len(clips)} cameras stay")
 
 
 def opencv_lens(values: Sequence[float], fisheye: bool, where: str) -> Lens:

@@ -14,7 +14,7 @@ import numpy as np
 
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.foreign import Keys, check_keys, parsed, pixels
+from gsstream.input.recordings.foreign import Keys, check_keys, parsed, pixels, reading
 from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.poses import invert
 from gsstream.input.recordings.rigs.camera import RigCamera
@@ -33,15 +33,13 @@ def read(path: Path, text: str) -> list[RigCamera]:
     """Return the cameras of a file; none when it is of another format."""
     if "<document" not in text or "<sensors" not in text:
         return []
-    try:
+    with reading(path, "cameras of Metashape"):
         root = ElementTree.fromstring(text)
         sensors = {entry.attrib["id"]: entry for entry in root.iter("sensor")}
         optics = {
             name: _optics(path, entry) for name, entry in sensors.items() if entry.find("calibration") is not None
         }
         return [_camera(path, entry, optics) for entry in root.iter("camera") if "label" in entry.attrib]
-    except (ElementTree.ParseError, KeyError, ValueError) as error:
-        raise SourceError(f"{path}: not cameras of Metashape: {error!r}") from error
 
 
 def _camera(path: Path, entry: ElementTree.Element, optics: dict[str, Optics]) -> RigCamera:

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from gsstream.core.errors import SourceError
-from gsstream.input.recordings.foreign import Keys, check_keys, parsed, pixels
+from gsstream.input.recordings.foreign import Keys, check_keys, parsed, pixels, reading
 from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.poses import OPENGL_TO_OPENCV, from_pixel_centers
 from gsstream.input.recordings.rigs.camera import RigCamera
@@ -35,11 +35,9 @@ def read(path: Path, text: str) -> list[RigCamera]:
     """Return the cameras of a file; none when it is of another format."""
     if "<calibration" not in text or "<intrinsic" not in text or "focalLengthU" not in text:
         return []
-    try:
+    with reading(path, "a calibration of Qualisys"):
         root = ElementTree.fromstring(text)
         return [_camera(path, entry) for entry in root.iter("camera") if entry.get("active", "1") != "0"]
-    except (ElementTree.ParseError, KeyError, ValueError) as error:
-        raise SourceError(f"{path}: not a calibration of Qualisys: {error!r}") from error
 
 
 def _camera(path: Path, entry: ElementTree.Element) -> RigCamera:

@@ -16,7 +16,7 @@ import numpy as np
 
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.foreign import Keys, check_keys, parsed
+from gsstream.input.recordings.foreign import Keys, check_keys, parsed, reading
 from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.poses import from_opengl, from_rotation_vector
 from gsstream.input.recordings.rigs.camera import RigCamera
@@ -43,15 +43,13 @@ _COLUMNS = Keys(read="#name x y alt heading pitch roll f px py k1 k2 k3 k4 t1 t2
 
 def read(path: Path, text: str) -> list[RigCamera]:
     """Return the camera of an XMP file, or all of a table; none when it is of another format."""
-    try:
+    with reading(path, "cameras of RealityCapture"):
         if "capturingreality.com/ns/xcr" in text:
             return [_from_metadata(path, ElementTree.fromstring(text))]
         if text.startswith("#name,") and "heading" in text.split("\n", 1)[0]:
             return [
                 _from_row(path, row) for row in csv.DictReader(text.splitlines(), restkey="(columns without a name)")
             ]
-    except (ElementTree.ParseError, KeyError, ValueError, TypeError) as error:
-        raise SourceError(f"{path}: not cameras of RealityCapture: {error!r}") from error
     return []
 
 

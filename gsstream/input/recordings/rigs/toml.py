@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gsstream.core.errors import SourceError
-from gsstream.input.recordings.foreign import Keys, check_keys, matrix, number, pixels
+from gsstream.input.recordings.foreign import Keys, check_keys, matrix, number, pixels, reading
 from gsstream.input.recordings.poses import from_pixel_centers, from_rotation_vector
 from gsstream.input.recordings.rigs.camera import RigCamera, opencv_lens
 
@@ -30,10 +30,8 @@ _KEYS = Keys(
 
 def read(path: Path, text: str) -> list[RigCamera]:
     """Return the cameras of a file; none when it describes no rig."""
-    try:
+    with reading(path, "valid TOML"):
         data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise SourceError(f"{path}: not valid TOML: {error}") from error
     tables = {**data, **(data["cameras"] if isinstance(data.get("cameras"), dict) else {})}
     rig = {
         key: table

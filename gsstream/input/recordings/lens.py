@@ -34,11 +34,14 @@ class Lens:
     k: tuple[float, ...]
     p: tuple[float, float] = (0.0, 0.0)  # tangential coefficients p1, p2
     s: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # those of a thin prism, s1 to s4 as OpenCV's
+    #: Of "radial": the fourth radial coefficient of programs in which none divides (Metashape, RealityCapture).
+    eighth: float = 0.0
+    skew: float = 0.0  # how much of y is added to x, on bent coordinates
 
     @property
     def is_identity(self) -> bool:
         """A fisheye never is: even with coefficients of zero it maps angles, not tangents."""
-        return self.kind != "fisheye" and not any((*self.k, *self.p, *self.s))
+        return self.kind != "fisheye" and not any((*self.k, *self.p, *self.s, self.eighth, self.skew))
 
     def distort(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return where this lens puts ideal pinhole coordinates."""
@@ -49,17 +52,16 @@ class Lens:
             slope = 2 * math.tan(angle / 2)
             factor = np.where(radius > 1e-12, np.arctan(radius * slope) / away, slope) / angle
             return x * factor, y * factor
-        top, bottom = self.k[:3], self.k[3:6]
+        top, bottom = (*(*self.k[:3], 0.0, 0.0, 0.0)[:3], self.eighth), self.k[3:6]
         if self.kind == "fisheye":
             top, bottom, factor = self.k, (), np.where(radius > 1e-12, np.arctan(radius) / away, 1.0)
             x, y = x * factor, y * factor
         square = x * x + y * y
         factor = (1 + _series(square, top)) / (1 + _series(square, bottom))
         (p1, p2), (s1, s2, s3, s4) = self.p, self.s
-        return (
-            x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x) + _series(square, (s1, s2)),
-            y * factor + p1 * (square + 2 * y * y) + 2 * p2 * x * y + _series(square, (s3, s4)),
-        )
+        u = x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x) + _series(square, (s1, s2))
+        v = y * factor + p1 * (square + 2 * y * y) + 2 * p2 * x * y + _series(square, (s3, s4))
+        return u + self.skew * v, v
 
 
 def _series(square: FloatArray, coefficients: tuple[float, ...]) -> FloatArray:

@@ -214,7 +214,11 @@ def spoil(text: str, new: str) -> Callable[[Path], None]:
         ("opencv", spoil("image_width", "width"), "expected image_width and image_height"),
         ("opencv", spoil("T: ", "nframes: "), "calibrate the rig, too"),
         ("qualisys", spoil('viewrotation="0"', 'viewrotation="90"'), "export it unturned"),
-        ("metashape", spoil("<k1>", "<k4>0.1</k4><k1>"), "k4 and b2"),
+        (
+            "metashape",
+            spoil('type="frame">', 'type="spherical">'),
+            r"^[^:]*cameras\.xml: sensor 'unknown': expected type",
+        ),
         ("realitycapture-xmp", spoil("brown3t2", "division"), "a model of Brown"),
     ],
 )

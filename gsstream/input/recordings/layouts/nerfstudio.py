@@ -24,8 +24,8 @@ import numpy as np
 from gsstream.core.errors import SourceError, suggest
 from gsstream.input.recordings.calibration import read_json
 from gsstream.input.recordings.clips import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Clip, folder_clip, listed_clips
-from gsstream.input.recordings.foreign import Keys, check_keys, inside, left_out, number, warn
-from gsstream.input.recordings.layouts.nerfstudio_camera import camera_of, pose_of
+from gsstream.input.recordings.foreign import Keys, check_keys, inside, left_out, number, parsed, warn
+from gsstream.input.recordings.layouts.nerfstudio_camera import COEFFICIENTS, camera_of, pose_of
 from gsstream.input.recordings.layouts.nerfstudio_groups import INTRINSICS, group_entries
 from gsstream.input.recordings.pointfiles import read_ply_points
 from gsstream.input.recordings.recorded import Recording, SeenPoints
@@ -124,6 +124,10 @@ def _load_one(path: Path) -> dict[str, Any]:
         {key: value for key, value in entry.items() if value is not None or key not in _OPTIONAL}
         for entry in (known, *frames)
     ]
+    for entry in (known, *frames):  # its converter of RealityCapture's tables writes coefficients as texts
+        for key in COEFFICIENTS:
+            if isinstance(value := entry.get(key), str):
+                entry[key] = float(parsed(str(path), key, [value], 1)[0])
     for place, entry in enumerate(frames):
         name = entry.get("file_path")
         if not isinstance(name, str) or not name:

@@ -29,7 +29,8 @@ _MODELS: dict[str, tuple[Literal["radial", "fisheye"], tuple[str, ...], tuple[st
     "RADIAL_FISHEYE": ("fisheye", ("k1", "k2"), ()),
     "OPENCV_FISHEYE": ("fisheye", ("k1", "k2", "k3", "k4"), ()),
 }
-_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+#: Keys of a lens.
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 def pose_of(path: Path, entry: dict[str, Any]) -> FloatArray:
@@ -91,7 +92,7 @@ def _lens(where: str, data: dict[str, Any], name: str) -> Lens:
     kind, radial, tangential = _MODELS[model]
     if fisheye is not None and fisheye != (kind == "fisheye"):
         raise SourceError(f"{where}: camera_model {model} of camera {name!r} contradicts is_fisheye {fisheye}")
-    values = {k: number(where, f"{k} of camera {name!r}", data[k]) for k in _COEFFICIENTS if k in data}
+    values = {k: number(where, f"{k} of camera {name!r}", data[k]) for k in COEFFICIENTS if k in data}
     if lost := next((k for k, value in values.items() if value and k not in (*radial, *tangential)), None):
         hint = (
             "; is it an OPENCV_FISHEYE?"

@@ -2,19 +2,20 @@
 
 ``sensor``: ``resolution`` and ``calibration`` (f, cx and cy from the middle of the picture, k1 ... k4, p1 and p2 in the
 other order than OpenCV's, b1, b2). ``camera``: ``label``, ``sensor_id`` and ``transform``, camera to chunk with OpenCV
-axes; the coordinates are those of the chunk.
+axes; the coordinates are those of the chunk, or of the component with the most cameras. Disabled cameras do not count.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections import Counter
+from pathlib import Path, PurePosixPath
 from xml.etree import ElementTree
 
 import numpy as np
 
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
-from gsstream.input.recordings.foreign import Keys, check_keys, parsed, pixels, reading
+from gsstream.input.recordings.foreign import Keys, check_keys, left_out, parsed, pixels, reading
 from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.poses import invert
 from gsstream.input.recordings.rigs.camera import RigCamera
@@ -39,7 +40,21 @@ def read(path: Path, text: str) -> list[RigCamera]:
         optics = {
             name: _optics(path, entry) for name, entry in sensors.items() if entry.find("calibration") is not None
         }
-        return [_camera(path, entry, optics) for entry in root.iter("camera") if "label" in entry.attrib]
+        entries = [
+            entry
+            for entry in root.iter("camera")
+            if "label" in entry.attrib and entry.get("enabled", "true") not in ("false", "0")
+        ]
+        return [_camera(path, entry, optics) for entry in _of_one_component(path, entries)]
+
+
+def _of_one_component(path: Path, entries: list[ElementTree.Element]) -> list[ElementTree.Element]:
+    """Cameras of different components have coordinates that nothing joins: those of the largest, and those of none."""
+    sizes = Counter(entry.get("component_id") for entry in entries if entry.find("transform") is not None)
+    first = sizes.most_common(1)[0][0] if sizes else None
+    other = [entry for entry in entries if sizes[entry.get("component_id")] and entry.get("component_id") != first]
+    left_out(str(path), "of other components", [entry.attrib["label"] for entry in other], len(entries) - len(other))
+    return [entry for entry in entries if entry not in other]
 
 
 def _camera(path: Path, entry: ElementTree.Element, optics: dict[str, Optics]) -> RigCamera:
@@ -49,7 +64,8 @@ def _camera(path: Path, entry: ElementTree.Element, optics: dict[str, Optics]) -
     w2c = None
     if transform and sensor in optics:
         w2c = invert(parsed(f"{path}: camera {label!r}", "transform", transform.split(), 16).reshape(4, 4))
-    return RigCamera(name=Path(label).stem, w2c=w2c, K=K, lens=lens, size=size)
+    name = PurePosixPath(label.replace("\\", "/")).stem
+    return RigCamera(name=name, w2c=w2c, K=K, lens=lens, size=size)
 
 
 def _optics(path: Path, sensor: ElementTree.Element) -> Optics:
@@ -64,10 +80,9 @@ def _optics(path: Path, sensor: ElementTree.Element) -> Optics:
         return float(parsed(where, key, [calibration.findtext(key) or 0], 1)[0])
 
     check_keys(where, [{part.tag: part.text for part in calibration}], _KEYS)
-    if number("k4") or number("b2"):
-        raise SourceError(f"{where}: k4 and b2 (skew) are not supported: optimise the cameras without them")
     width, height = (pixels(where, key, int(resolution.attrib[key])) for key in ("width", "height"))
     f, cx, cy = number("f"), width / 2 + number("cx"), height / 2 + number("cy")
     K = np.array([[f + number("b1"), 0, cx], [0, f, cy], [0, 0, 1.0]])
-    lens = Lens("radial", (number("k1"), number("k2"), number("k3")), (number("p2"), number("p1")))
+    k, p = (number("k1"), number("k2"), number("k3")), (number("p2"), number("p1"))
+    lens = Lens("radial", k, p, eighth=number("k4"), skew=number("b2") / K[0, 0] if K[0, 0] else 0.0)
     return K, lens, (width, height)

@@ -39,10 +39,8 @@ def check_matches(cameras: Cameras, pairs: list[PairMatches], *, rig_only: bool 
         return [
             note(
                 "epipolar",
-                (
-                    f"the pictures of frame 0 share too few features to check the calibration ({len(pairs)} pairs of "
-                    f"cameras with at least {MIN_MATCHES} matches); look at the first frame of a run instead"
-                ),
+                f"the pictures of frame 0 share too few features to check the calibration ({len(pairs)} pairs of "
+                f"cameras with at least {MIN_MATCHES} matches); look at the first frame of a run instead",
             )
         ]
     bad = _suspect_cameras(cameras, pairs, limit)
@@ -116,11 +114,9 @@ def _whole_rig(cameras: Cameras, pairs: list[PairMatches], limit: float) -> list
     return [
         error(
             "epipolar",
-            (
-                f"the pictures contradict the calibration: matches lie {usual:.1f} pixels off their epipolar lines in "
-                f"most pairs of cameras, expected at most {limit:.1f}; calibrate again, or let 'gsstream scene "
-                "prepare' do so"
-            ),
+            f"the pictures contradict the calibration: matches lie {usual:.1f} pixels off their epipolar lines in "
+            f"most pairs of cameras, expected at most {limit:.1f}; calibrate again, or let 'gsstream scene "
+            "prepare' do so",
         )
     ]
 

@@ -50,10 +50,8 @@ def check_blank(thumbs: Thumbnails) -> list[Finding]:
             found.append(
                 error(
                     "blank",
-                    (
-                        f"camera {name!r}: {_listed(frames)} {what} (no structure); export again, or end the "
-                        "recording before"
-                    ),
+                    f"camera {name!r}: {_listed(frames)} {what} (no structure); export again, or end the "
+                    "recording before",
                 )
             )
     return found
@@ -70,10 +68,8 @@ def check_same(thumbs: Thumbnails) -> list[Finding]:
                 found.append(
                     error(
                         "same",
-                        (
-                            f"cameras {thumbs.cameras.ids[a]!r} and {thumbs.cameras.ids[b]!r}, {kinds}, show the same "
-                            "pictures; take one of them out, or export the right ones"
-                        ),
+                        f"cameras {thumbs.cameras.ids[a]!r} and {thumbs.cameras.ids[b]!r}, {kinds}, show the same "
+                        "pictures; take one of them out, or export the right ones",
                     )
                 )
     return found
@@ -90,10 +86,8 @@ def check_change(thumbs: Thumbnails) -> list[Finding]:
     found = [
         error(
             "frozen",
-            (
-                f"camera {name!r} shows one picture in all {len(thumbs.images)} frames while others change; check its "
-                "capture, or take it out"
-            ),
+            f"camera {name!r} shows one picture in all {len(thumbs.images)} frames while others change; check its "
+            "capture, or take it out",
         )
         for name, stands in zip(thumbs.cameras.ids, frozen, strict=True)
         if stands
@@ -105,10 +99,8 @@ def check_change(thumbs: Thumbnails) -> list[Finding]:
             found.append(
                 error(
                     "repeated",
-                    (
-                        f"camera {thumbs.cameras.ids[c]!r}: {_listed(frames)} the same picture as the one before "
-                        "while others go on; a frame was lost there. Export again, and check that the rest is in step"
-                    ),
+                    f"camera {thumbs.cameras.ids[c]!r}: {_listed(frames)} the same picture as the one before "
+                    "while others go on; a frame was lost there. Export again, and check that the rest is in step",
                 )
             )
     return found or check_brightness(thumbs)
@@ -122,10 +114,8 @@ def check_brightness(thumbs: Thumbnails) -> list[Finding]:
     found = [
         warning(
             "brightness",
-            (
-                f"all cameras change by {100 * (np.exp(common[t]) - 1):+.0f} % in brightness at frame {t + 1}: light "
-                "or exposure. Lock the exposure; a stream pays for such a frame with a large packet"
-            ),
+            f"all cameras change by {100 * (np.exp(common[t]) - 1):+.0f} % in brightness at frame {t + 1}: light "
+            "or exposure. Lock the exposure; a stream pays for such a frame with a large packet",
         )
         for t in np.flatnonzero(np.abs(common) > JUMP)
     ]
@@ -135,10 +125,8 @@ def check_brightness(thumbs: Thumbnails) -> list[Finding]:
         found.append(
             warning(
                 "brightness",
-                (
-                    f"camera {thumbs.cameras.ids[c]!r} jumps by {100 * (np.exp(steps[when, c]) - 1):+.0f} % in "
-                    f"brightness at frame {when + 1}, alone; switch its automatic exposure off"
-                ),
+                f"camera {thumbs.cameras.ids[c]!r} jumps by {100 * (np.exp(steps[when, c]) - 1):+.0f} % in "
+                f"brightness at frame {when + 1}, alone; switch its automatic exposure off",
             )
         )
     return found

@@ -78,11 +78,9 @@ def check_poses(frame: Frame) -> list[Finding]:
     return [
         error(
             "axes",
-            (
-                f"the pictures of frame {frame.index} fit each other if the poses are {what}, and not as they are "
-                f"given ({100 * best:.0f} % of their texture is at one place for several cameras, instead of "
-                f"{100 * given:.0f} %): {cure}"
-            ),
+            f"the pictures of frame {frame.index} fit each other if the poses are {what}, and not as they are "
+            f"given ({100 * best:.0f} % of their texture is at one place for several cameras, instead of "
+            f"{100 * given:.0f} %): {cure}",
         )
     ]
 
@@ -108,10 +106,8 @@ def check_swapped(frame: Frame) -> list[Finding]:
             return [
                 error(
                     "axes",
-                    (
-                        f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r} are swapped: the pictures of frame "
-                        f"{frame.index} fit with each other's pose; exchange their images or their poses"
-                    ),
+                    f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r} are swapped: the pictures of frame "
+                    f"{frame.index} fit with each other's pose; exchange their images or their poses",
                 )
             ]
     return []

@@ -29,10 +29,8 @@ def check_intrinsics(cameras: Cameras) -> list[Finding]:
             found.append(
                 error(
                     "intrinsics",
-                    (
-                        f"{where}; K looks like that of images of {round(width * scale)} x {round(height * scale)}. "
-                        f"Multiply the first two rows of K by {1 / scale:.3g}"
-                    ),
+                    f"{where}; K looks like that of images of {round(width * scale)} x {round(height * scale)}. "
+                    f"Multiply the first two rows of K by {1 / scale:.3g}",
                 )
             )
         elif not ((share > 0) & (share < 1)).all():
@@ -44,11 +42,9 @@ def check_intrinsics(cameras: Cameras) -> list[Finding]:
             found.append(
                 error(
                     "intrinsics",
-                    (
-                        f"camera {name!r}: focal lengths {K[0, 0]:.4g} and {K[1, 1]:.4g} pixels mean a field of view "
-                        f"of {angles[0]:.0f} x {angles[1]:.0f} degrees; expected 2 to 150. Give focal lengths in "
-                        "pixels"
-                    ),
+                    f"camera {name!r}: focal lengths {K[0, 0]:.4g} and {K[1, 1]:.4g} pixels mean a field of view "
+                    f"of {angles[0]:.0f} x {angles[1]:.0f} degrees; expected 2 to 150. Give focal lengths in "
+                    "pixels",
                 )
             )
     return found
@@ -72,10 +68,8 @@ def check_placement(cameras: Cameras, train: int, points: PointCloud | None) -> 
         found.append(
             error(
                 "placement",
-                (
-                    f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r}, {kinds}, have the same pose; {advice}, or "
-                    "correct w2c"
-                ),
+                f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r}, {kinds}, have the same pose; {advice}, or "
+                "correct w2c",
             )
         )
     if len(same) == 0 and len(cameras) > 3:
@@ -85,10 +79,8 @@ def check_placement(cameras: Cameras, train: int, points: PointCloud | None) -> 
         found = [
             error(
                 "placement",
-                (
-                    f"camera {cameras.ids[i]!r} is {distance[i]:.4g} units away from the middle of the rig, the others "
-                    f"about {usual:.4g}; its translation is probably in another unit (mm instead of m?)"
-                ),
+                f"camera {cameras.ids[i]!r} is {distance[i]:.4g} units away from the middle of the rig, the others "
+                f"about {usual:.4g}; its translation is probably in another unit (mm instead of m?)",
             )
             for i in np.flatnonzero(distance > FAR * max(usual, 1e-12))
         ]
@@ -105,10 +97,8 @@ def _points_unit(cameras: Cameras, points: PointCloud) -> list[Finding]:
     return [
         error(
             "placement",
-            (
-                f"the points of frame 0 spread over {spread:.4g} units, the rig over {cameras.extent:.4g}: one of "
-                "them is probably in mm and the other in m; bring poses and points to one unit"
-            ),
+            f"the points of frame 0 spread over {spread:.4g} units, the rig over {cameras.extent:.4g}: one of "
+            "them is probably in mm and the other in m; bring poses and points to one unit",
         )
     ]
 
@@ -124,11 +114,9 @@ def check_axes(cameras: Cameras) -> list[Finding]:
         return [
             error(
                 "axes",
-                (
-                    "every camera has the point where the optical axes meet behind it: the poses look like those of "
-                    "OpenGL (y up, z backwards). Multiply the second and third row of w2c by -1. A rig that looks "
-                    "outwards has no common view to reconstruct"
-                ),
+                "every camera has the point where the optical axes meet behind it: the poses look like those of "
+                "OpenGL (y up, z backwards). Multiply the second and third row of w2c by -1. A rig that looks "
+                "outwards has no common view to reconstruct",
             )
         ]
     return []
@@ -151,10 +139,8 @@ def check_overlap(cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
             found.append(
                 error(
                     "overlap",
-                    (
-                        f"camera {name!r} shares its view with no other training camera ({100 * share:.0f} % of it); "
-                        "check its pose, or take it out"
-                    ),
+                    f"camera {name!r} shares its view with no other training camera ({100 * share:.0f} % of it); "
+                    "check its pose, or take it out",
                 )
             )
     return found

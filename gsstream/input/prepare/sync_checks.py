@@ -77,10 +77,8 @@ def _told(name: str, clock: Clock, reach: int) -> Finding:
         cure = f"No larger offset was tried; more are with --frames {math.ceil(2 * reach / REACH)}"
     return error(
         "sync",
-        (
-            f"camera {name!r} is {count} {'late' if late > 0 else 'early'}: what moves is at another place than in the "
-            f"other cameras. {cure}"
-        ),
+        f"camera {name!r} is {count} {'late' if late > 0 else 'early'}: what moves is at another place than in the "
+        f"other cameras. {cure}",
     )
 
 
@@ -92,10 +90,8 @@ def _unknown(cameras: Cameras, seen: list[Motion], lost: list[int]) -> list[Find
     return [
         note(
             "sync",
-            (
-                f"clocks{which}: not checkable (what moves covers {share:.1g} % of the pictures from one frame to the "
-                "next); more frames may show more"
-            ),
+            f"clocks{which}: not checkable (what moves covers {share:.1g} % of the pictures from one frame to the "
+            "next); more frames may show more",
         )
     ]
 
@@ -208,10 +204,8 @@ def _swapped(cameras: Cameras, seen: list[Motion], now: FloatArray) -> list[Find
             found.append(
                 error(
                     "sync",
-                    (
-                        f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r} are swapped: each sees what moves where "
-                        "the other should; exchange their images or their poses"
-                    ),
+                    f"cameras {cameras.ids[a]!r} and {cameras.ids[b]!r} are swapped: each sees what moves where "
+                    "the other should; exchange their images or their poses",
                 )
             )
     return found
@@ -226,10 +220,8 @@ def _better_poses(cameras: Cameras, seen: list[Motion], curves: FloatArray) -> l
             return [
                 error(
                     "axes",
-                    (
-                        f"what moves is at one place in all cameras if the poses are {what}, and at several places as "
-                        f"they are given: {cure}. Clocks were compared by poses that do not fit"
-                    ),
+                    f"what moves is at one place in all cameras if the poses are {what}, and at several places as "
+                    f"they are given: {cure}. Clocks were compared by poses that do not fit",
                 )
             ]
     return []

@@ -66,7 +66,8 @@ class WatchSource(Source):
             depth_maps=folder / FOLDER,
         )
         self._plans: dict[int, _Plan] = {}  # only frames that are not delivered whole
-        self._next, self._skip_to, self._newest = 0, 0, 0
+        self._next, self._skip_to, self._newest, self._ahead = 0, 0, 0, 0
+        self._gone: frozenset[str] = frozenset()  # cameras that the last frame was made without
         self._numbers = Numbering(folder, calibration.patterns)
         self._decoded: dict[tuple[str, int], Any] = {}  # of the frame that is waited for
         self._faults: dict[str, str] = {}
@@ -170,6 +171,7 @@ class WatchSource(Source):
         if 0 < index < self._skip_to:  # images of all training cameras came, and newer ones
             return _Plan(0.0, tuple((name, self._last[name]) for name in self._ids), skipped=True)
         absent = self._wait(index)
+        self._gone = frozenset(absent)
         untrained = [name for name in absent if name in self._train]
         held = tuple((name, self._last[name]) for name in absent)
         if untrained and self._options.missing == "drop":
@@ -184,7 +186,9 @@ class WatchSource(Source):
             return 0.0
         self._newest = max(self._newest, index)
         last = float("inf") if self._declared is None else self._declared - 1
-        while self._newest < last and all(self._path(name, self._newest + 1).exists() for name in self._train):
+        # What a camera that is gone does not send keeps no frame from having come.
+        names = self._train - self._gone or self._train
+        while self._newest < last and all(self._path(name, self._newest + 1).exists() for name in names):
             self._newest += 1
         waiting = self._newest - index
         if waiting <= self._options.queue:
@@ -269,9 +273,12 @@ class WatchSource(Source):
         if all(self._path(name, index + 1).exists() for name in absent):
             return True  # they have moved on: this image will not come
         # Times of files are those of the writer's clock, which may be ahead of ours or behind: they are compared with
-        # each other, never with the time here.
-        newest, later = (self._newest_of(whole, frame) for frame in (index, index + 1))
-        passed = 0.0 if newest is None or later is None else later - newest
+        # each other, never with the time here. Who is behind meets frames whose grace was over long ago.
+        self._ahead = max(self._ahead, index)
+        while any(self._path(name, self._ahead + 1).exists() for name in whole):
+            self._ahead += 1
+        newest, *later = (self._newest_of(whole, frame) for frame in (index, index + 1, self._ahead))
+        passed = 0.0 if newest is None else max((time - newest for time in later if time is not None), default=0.0)
         return max(waited, passed) >= self._options.grace
 
     def _newest_of(self, names: set[str], index: int) -> float | None:

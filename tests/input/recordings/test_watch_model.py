@@ -177,3 +177,31 @@ def test_a_camera_that_pauses_after_end_ends_nothing(policy: str, tmp_path: Path
     assert [frame["a"] for frame in shown] == list(range(10))
     assert [frame["b"] for frame in shown] == [0, 1, 1, 1, 1, 1, 6, 7, 8, 9]
     assert told == ""
+
+
+def behind(policy: str, options: str, place: Path) -> tuple[list[float], float]:
+    """What frames are worth, and how long the watcher waited: a backlog of 200, of which a camera lacks a hundred."""
+    numbers = {name: frozenset(range(200)) for name in NAMES} | {"b": frozenset({*range(50), *range(150, 200)})}
+    writer = Writer(folder_of(place), sorted((t / 10, name, t) for name in NAMES for t in numbers[name]))
+    writer.wait(100.0)
+    black = np.zeros((1, 1, 3), np.uint8)
+    with mock.patch.object(watch, "time", writer), mock.patch.object(watch, "read_stored", return_value=black):
+        live = WatchSource.from_query(f"{place}?missing={policy}&grace=2&poll=0.01&ready=rename&{options}")
+        live._stop = writer  # type: ignore[assignment]
+        return [live.moment(index).epoch_scale for index in range(200)], writer.now - 100.0
+
+
+@pytest.mark.parametrize("policy", ["hold", "drop"])
+def test_a_run_that_is_behind_waits_for_nobody_who_is_gone(policy: str, tmp_path: Path) -> None:
+    """The frames of a pause lie long ago: their grace is over, also where it is longer than the time between two."""
+    worth, waited = behind(policy, "behind=block", tmp_path)
+    assert worth == [1.0] * 50 + [1.0 if policy == "hold" else 0.0] * 100 + [1.0] * 50
+    assert waited < 5.0, "only for the last ones, which nobody has passed yet"
+
+
+@pytest.mark.parametrize("policy", ["hold", "drop"])
+def test_a_camera_that_is_gone_keeps_no_run_from_dropping_frames(policy: str, tmp_path: Path) -> None:
+    worth, waited = behind(policy, "behind=drop&queue=8", tmp_path)
+    assert sum(worth) < 15
+    assert worth[-1] == 1.0
+    assert waited < 5.0

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -53,9 +54,16 @@ class FolderWriter:
         return shutil.disk_usage(self._out).free
 
     def add(self, pictures: Mapping[int, bytes], told: Mapping[str, Any]) -> None:
-        """Write one instant: files by camera, and its line of the log."""
-        for number, data in pictures.items():
-            self._put(self._out / self._plans[number].name / f"{self.frames:06d}.jpg", data)
+        """Write one instant: files by camera, and its line of the log.
+
+        They get their names when all are written: who follows takes a camera that is behind the others for gone.
+        """
+        paths = {
+            self._out / self._plans[number].name / f"{self.frames:06d}.jpg": pictures[number] for number in pictures
+        }
+        parts = [self._part(path, data) for path, data in paths.items()]
+        for part, path in zip(parts, paths, strict=True):
+            self._named(part, path)
         self._log.write(json.dumps({"frame": self.frames, **told}) + "\n")
         self._log.flush()
         self.frames += 1
@@ -66,12 +74,25 @@ class FolderWriter:
         (self._out / END).touch()
 
     def _put(self, path: Path, data: bytes) -> None:
+        self._named(self._part(path, data), path)
+
+    def _part(self, path: Path, data: bytes) -> Path:
         part = path.with_name(f"{path.name}.part")
-        try:
+        with _told(path):
             part.write_bytes(data)
+        return part
+
+    def _named(self, part: Path, path: Path) -> None:
+        with _told(path):
             part.replace(path)
-        except OSError as error:
-            raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
 def claim(out: Path) -> None:

@@ -23,9 +23,13 @@ from gsstream.input.recordings.base import Source, Wrapped
 from gsstream.input.recordings.calibration import CALIBRATION_FILE
 from gsstream.input.recordings.options import WatchOptions, options_of_query
 from gsstream.input.recordings.watch import WatchSource
+from gsstream_capture.rig import read_rig
 
 #: What differs from ``watch:`` where nothing else is asked for: a live run never waits for a camera that is gone.
 USUAL = {"ready": "rename", "behind": "drop", "missing": "hold", "queue": "8", "poll": "0.01"}
+#: How long a camera without a picture is waited for, as a share of the time between instants. All pictures of an
+#: instant get their names together, so what is not there is absent; a camera that is gone costs no other frame.
+WAITED = 0.5
 #: Seconds that the process that captures gets to write its last instant.
 ENDING = 15.0
 
@@ -41,10 +45,10 @@ def open_rig(uri: str, scale: float = 1.0) -> Source:
     text, _, query = uri.removeprefix("rig:").partition("?")
     if not text:
         raise SourceError("rig source: expected rig:RIG.yaml or rig:RIG.yaml?key=value&..., got no file")
-    given = {part.partition("=")[0] for part in query.split("&")}
-    usual = "&".join(f"{key}={value}" for key, value in USUAL.items() if key not in given)
-    options = options_of_query(RigOptions, "&".join(filter(None, (query, usual))), "rig source")
-    rig = Path(text)
+    given, rig = {part.partition("=")[0] for part in query.split("&")}, Path(text)
+    usual = USUAL | {"grace": f"{WAITED / read_rig(rig).fps:.6f}"}
+    usual_query = "&".join(f"{key}={value}" for key, value in usual.items() if key not in given)
+    options = options_of_query(RigOptions, "&".join(filter(None, (query, usual_query))), "rig source")
     folder = Path(options.folder) if options.folder else rig.with_name(f"{rig.stem}-{time.strftime('%Y%m%d-%H%M%S')}")
     if folder.exists() and any(folder.iterdir()):
         raise SourceError(f"rig source: folder {folder} is not empty; name a new one")

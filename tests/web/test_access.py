@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import ssl
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -211,6 +213,26 @@ def test_offline_is_said(site, tmp_path):
     ]
     with serving(site) as (url, _):
         try_in_browser(at(url, steps), tmp_path)
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed, which makes a certificate")
+def test_http_from_a_page_with_https_is_said(site, tmp_path):
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    make = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj", "/CN=127.0.0.1"]
+    subprocess.run([*make, "-keyout", str(key), "-out", str(certificate)], check=True, capture_output=True)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key)
+    flags = ["--ignore-certificate-errors", "--host-resolver-rules=MAP other.test 127.0.0.1"]
+    with serving(site) as (plain, _), serving(site) as (safe, server):
+        server.socket = context.wrap_socket(server.socket, server_side=True)
+        page = safe.replace("http:", "https:")
+        steps = [
+            ["go", f"{page}/index.html?src={plain.replace('127.0.0.1', 'other.test')}/stream.gss"],
+            ["until", f"{MESSAGE}.includes('by https')", 20],
+            ["go", f"{page}/index.html"],
+            READY,
+        ]
+        try_in_browser(steps, tmp_path, flags=flags)
 
 
 @needs_node

@@ -9,6 +9,14 @@ from typing import Annotated
 
 import typer
 
+Source = Annotated[
+    str, typer.Option("--source", help="demo, synthetic:K=V&..., watch:DIR, DIR, LAYOUT:DIR, s3://BUCKET/DIR.")
+]
+Out = Annotated[str, typer.Option("--out", help="Output folder, or s3://BUCKET/DIR; must not hold another run.")]
+Serve = Annotated[
+    int | None,
+    typer.Option("--serve", metavar="PORT", min=0, max=65535, help="Show the frames live at this port (extra: serve)."),
+]
 Recipes = Annotated[
     list[Path] | None,
     typer.Option(

@@ -33,21 +33,14 @@ SUGGESTED = ("s2gs-fast", "queen")
 
 @grouped
 def run(
-    source: Annotated[
-        str, typer.Option("--source", help="demo, synthetic:K=V&..., watch:DIR, DIR, LAYOUT:DIR, s3://BUCKET/DIR.")
-    ],
-    out: Annotated[str, typer.Option("--out", help="Output folder, or s3://BUCKET/DIR; must not hold another run.")],
+    source: options.Source,
+    out: options.Out,
     recipe: options.RecipeOptions,
     shown: options.ShownOptions,
     first_frame: options.FirstFrame = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run that --out holds.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run that --out holds.")] = False,
-    serve: Annotated[
-        int | None,
-        typer.Option(
-            "--serve", metavar="PORT", min=0, max=65535, help="Show the frames live at this port (extra: serve)."
-        ),
-    ] = None,
+    serve: options.Serve = None,
 ) -> None:
     """Encode a recording as a stream of 3D Gaussians.
 
@@ -63,8 +56,7 @@ def run(
     catalog, results = load_catalog(), Results(out)
     resolved = resolve_recipe(recipe.method, catalog.recipe_path, recipe.recipe or (), recipe.overrides())
     folder, wanted, quiet = results.folder, shown.wanted(), shown.quiet
-    server = server_beside(folder, serve)
-    say = _silent if quiet else _note
+    server, say = server_beside(folder, serve), _silent if quiet else _note
     with working("loading the method", quiet) as display:
         # The slow imports come last: a mistake on the command line is answered at once.
         from gsstream.engine.assembly.assemble import assemble

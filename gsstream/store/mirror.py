@@ -5,13 +5,12 @@ from __future__ import annotations
 import hashlib
 import re
 import threading
-import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from gsstream.core.errors import OutputError
 from gsstream.store.place import Place
-from gsstream.store.troubles import StoreSilent
+from gsstream.store.troubles import StoreSilent, patiently
 
 #: Seconds between two looks at the folder, and bytes of the longest part: no more is in memory at a time.
 LOOK, LONGEST = 1.0, 8 << 20
@@ -52,16 +51,10 @@ class Mirror:
 
     def finish(self, patience: float) -> None:
         """Bring every file whole, within as many seconds. Raises OutputError when that fails; the folder keeps them."""
-        deadline = time.monotonic() + patience
-        while True:
-            try:
-                self._bring_whole()
-                return
-            except StoreSilent as error:
-                if time.monotonic() > deadline:
-                    raise OutputError(f"{error}. Everything is in {self.folder} meanwhile") from error
-                self._warn(error)
-                time.sleep(LOOK)
+        try:
+            patiently(self._bring_whole, patience, self._warn)
+        except StoreSilent as error:
+            raise OutputError(f"{error}. Everything is in {self.folder} meanwhile") from error
 
     def _run(self) -> None:
         while not self._over.wait(LOOK):

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import errno
 import re
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TypeVar
 from urllib.parse import urlsplit
 
-from gsstream.core.errors import GsstreamError, InputError
+from gsstream.core.errors import GsstreamError, InputError, OutputError, SourceError
 from gsstream.store.address import how_to_sign
 
+T = TypeVar("T")
+#: Seconds between two tries.
+PAUSE = 1.0
 _UNSIGNED = re.compile(r"Credential|ProfileNotFound|SSO|TokenRetrieval")
 #: Names of the errors that botocore and aiohttp raise when nobody answers; both are imported only by fsspec.
 _SILENT = re.compile(r"Timeout|Connect|Disconnected|Payload|IncompleteRead|HTTPClient|ClientOSError")
@@ -18,8 +23,8 @@ _SILENT = re.compile(r"Timeout|Connect|Disconnected|Payload|IncompleteRead|HTTPC
 _SECRET = re.compile(r"\?\S+|(?i:(authorization|credential|signature|secret|token|key)\w*\s*[=:]\s*)\S+")
 
 
-class StoreSilent(InputError):
-    """A store that does not answer now, and may later."""
+class StoreSilent(SourceError, OutputError):
+    """A store that does not answer now, and may later; whether it was to be read or written, that is all there is."""
 
 
 @contextmanager
@@ -31,6 +36,22 @@ def store_errors(address: str, kind: type[InputError]) -> Iterator[None]:
         raise
     except Exception as error:  # three libraries, whose errors share no base
         raise _told(error, address, kind) from None
+
+
+def patiently(do: Callable[[], T], seconds: float, silent: Callable[[StoreSilent], object] = lambda _: None) -> T:
+    """Return what ``do`` returns, and try again while the store does not answer, for as long as that; say so once."""
+    deadline = time.monotonic() + seconds
+    told = False
+    while True:
+        try:
+            return do()
+        except StoreSilent as error:
+            if time.monotonic() > deadline:
+                raise
+            if not told:
+                silent(error)
+            told = True
+            time.sleep(PAUSE)
 
 
 def _told(error: Exception, address: str, kind: type[InputError]) -> InputError:

@@ -8,6 +8,7 @@ GROUP = "Measure"
 #: name -> (function or Typer app in ``gsstream_lab.commands``, one line for ``gsstream --help``)
 COMMANDS = {
     "sweep": ("sweep:sweep", "Run every recipe of a sweep on every scene with every seed."),
+    "batch": ("batch:batch", "Encode every recording of a list with one method."),
     "report": ("report:report", "Write report.html (one file, no network), report.md and its figures."),
     "compare": ("compare:compare", "Encode one recording with several methods and show them side by side."),
     "evaluate-files": (

@@ -14,7 +14,7 @@ import typer
 from gsstream.cli import options
 
 if TYPE_CHECKING:
-    from gsstream_lab.jobs.base import Executor
+    from gsstream_lab.jobs.base import Executor, Work
     from gsstream_lab.sweep.config import Scene
 
 
@@ -71,12 +71,12 @@ class WorkerOptions:
         typer.Option("--ray", metavar="ADDRESS", help="Run on this Ray cluster (extra: ray); 'local' starts one here."),
     ] = None
 
-    def executor(self) -> Executor:
-        """Return workers that run the cells of one sweep."""
+    def executor(self, work: Work | None = None) -> Executor:
+        """Return workers that do ``work``; None: that run the cells of one sweep."""
         from gsstream_lab.jobs.executor import make_executor
         from gsstream_lab.sweep.job import run_job
 
-        return make_executor(run_job, self.workers, self.threads, self.ray)
+        return make_executor(work or run_job, self.workers, self.threads, self.ray)
 
 
 def progress(quiet: bool) -> Callable[[str], Any]:

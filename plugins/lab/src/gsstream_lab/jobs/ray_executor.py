@@ -1,5 +1,5 @@
-"""The same cells on a Ray cluster (extra: ray). Jobs and outcomes are data, so workers need no shared folder but the
-recordings, at the same place on every machine."""
+"""The same jobs on a Ray cluster (extra: ray). Jobs and outcomes are data, so workers need no shared folder: recordings
+lie at an address, or at the same place on every machine."""
 
 from __future__ import annotations
 
@@ -28,6 +28,8 @@ class RayExecutor:
         options: dict[str, Any] = {"log_to_driver": False, "logging_level": "warning"}
         if local:
             options |= {"include_dashboard": False, "num_cpus": workers * threads if workers else None}
+            # Ray gives its workers a niceness of 15, and this machine is the user's own.
+            os.environ.setdefault("RAY_worker_niceness", "0")
         else:
             options["address"] = address
         try:
@@ -48,7 +50,8 @@ class RayExecutor:
     def submit(self, job: Any) -> None:
         """Add the job to the queue as a task."""
         # Another machine has no such folder; it takes its own for temporary files.
-        self._running[self._remote.remote(replace(job, work=None))] = job.id
+        make = self._remote.options(memory=job.memory) if job.memory else self._remote
+        self._running[make.remote(replace(job, work=None))] = job.id
 
     def next(self) -> Finished:
         """Wait for a task; a task whose worker or machine went away has no outcome."""

@@ -190,7 +190,7 @@ class SceneList(Section):
 
 def read_sweep(path: Path, scenes: Path | None = None, split: SplitName | None = None) -> SweepConfig:
     """Read a sweep's YAML file. Raises RecipeError with file and line of every problem."""
-    config = _read(path, SweepConfig)
+    config = read_config(path, SweepConfig)
     if split is not None:
         config = config.model_copy(update={"split": split})
     if scenes is None:
@@ -199,12 +199,13 @@ def read_sweep(path: Path, scenes: Path | None = None, split: SplitName | None =
         scene.model_copy(update={"recipe": os.path.relpath(recipe_file(scene.recipe, scenes.parent), path.parent)})
         if scene.recipe
         else scene
-        for scene in _read(scenes, SceneList).scenes
+        for scene in read_config(scenes, SceneList).scenes
     ]
     return SweepConfig.model_validate({**config.model_dump(), "scenes": [scene.model_dump() for scene in found]})
 
 
-def _read(path: Path, model: type[Model]) -> Model:
+def read_config(path: Path, model: type[Model]) -> Model:
+    """Read a YAML file as a model. Raises RecipeError with file and line of every problem."""
     layer = read_file(path)
     values: dict[str, Any] = {}
     for keys, leaf in layer.leaves.items():
@@ -222,7 +223,7 @@ def _read(path: Path, model: type[Model]) -> Model:
     problems: list[str] = []
     config = validate(model, values, origin, prefix=(), problems=problems)
     join_problems(problems, str(path))
-    assert config is not None, "an invalid sweep leaves at least one problem"
+    assert config is not None, "an invalid file leaves at least one problem"
     return config
 
 

@@ -39,6 +39,7 @@ class Job:
     measure: Measure | None = None  # what to measure; None for a frame 0 that is only to be shared
     work: str | None = None  # folder for temporary files, or None for the system's
     alone: bool = False  # whether no other cell runs beside it, so that the machine's energy is its own
+    memory: int = 0  # bytes that a cluster keeps free for it; 0: nobody knows
 
 
 @dataclass(frozen=True, slots=True)

@@ -130,7 +130,7 @@ def meant_for(uri: str) -> str | None:
 
     layout, colon, _ = uri.partition(":")
     if not (colon and layout in LAYOUTS):
-        layout = detect(Path(uri)) if Path(uri).is_dir() else ""
+        layout = detect(Path(uri)) if uri != "demo" and Path(uri).is_dir() else ""
     return OF_LAYOUT.get(layout)
 
 

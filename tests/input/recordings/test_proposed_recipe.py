@@ -23,8 +23,11 @@ def test_the_layout_names_the_recipe(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("uri", ["demo", "synthetic:frames=2", "watch:capture", "disturbed:gain=2:demo", "n4dv:x"])
-def test_other_sources_have_none(uri: str) -> None:
+def test_other_sources_have_none(uri: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert meant_for(uri) is None
+    (tmp_path / uri).mkdir()  # a folder that has the name of a source by chance is not what is meant
+    monkeypatch.chdir(tmp_path)
+    assert uri == "n4dv:x" or meant_for(uri) is None
 
 
 def test_a_run_says_so_in_one_line_and_applies_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

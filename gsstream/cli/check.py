@@ -24,7 +24,7 @@ class Subject:
 
     heading: str
     results: list[CheckResult]
-    absent: bool = False  # it cannot be made on this machine, so that nothing could be checked
+    absent: bool = False  # the part cannot be made on this machine, so that nothing could be checked
     effect: str = ""  # what it does to a tiny recording
 
 
@@ -109,8 +109,8 @@ def _subjects(catalog: Catalog, name: str, source: str | None, settings: list[st
         run_packet_checks,
         skip_checks,
     )
-    from gsstream.testing.recording import SourceUnderTest
-    from gsstream.testing.working import effect
+    from gsstream.testing.method_driver import effect
+    from gsstream.testing.registry import SourceUnderTest
 
     if name == "packets":
         yield Subject("packet format", run_packet_checks())

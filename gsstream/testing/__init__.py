@@ -13,7 +13,7 @@ from gsstream.testing.kit import CheckResult as CheckResult
 from gsstream.testing.kit import parametrize_with_checks as parametrize_with_checks
 from gsstream.testing.kit import run_checks as run_checks
 from gsstream.testing.method_driver import MethodUnderTest as MethodUnderTest
-from gsstream.testing.recording import SourceUnderTest as SourceUnderTest
+from gsstream.testing.registry import SourceUnderTest as SourceUnderTest
 
 __all__ = [
     "CheckResult", "MethodUnderTest", "SourceUnderTest", "World", "get_case", "images", "make_case",

@@ -25,10 +25,8 @@ from gsstream.engine.assembly.part_in_use import line_of
 from gsstream.parts.gate.base import GateSampler
 from gsstream.testing import device as device
 from gsstream.testing.cases import EXTREMES, World, fingerprint, get_case
-from gsstream.testing.compare import ROUNDING, all_equal, finite
-from gsstream.testing.drive import Poison, behaviour_of, draw, outputs
-from gsstream.testing.recording import SourceUnderTest
-from gsstream.testing.registry import BEHAVED, MIN_REASON, Advice, Skip, check, checks_for, kind_of
+from gsstream.testing.compare import ROUNDING, Poison, all_equal, behaviour_of, draw, finite, outputs
+from gsstream.testing.registry import BEHAVED, MIN_REASON, Advice, Skip, SourceUnderTest, check, checks_for, kind_of
 
 ALL = tuple(CONTRACTS)
 

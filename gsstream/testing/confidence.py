@@ -9,8 +9,7 @@ import torch
 
 from gsstream.parts.confidence.base import ConfidenceEstimator
 from gsstream.testing.cases import EXTREMES, World, get_case
-from gsstream.testing.compare import at_most, equal, finite
-from gsstream.testing.drive import Behaviour, Outputs, Poison, has_shape, poisons_of
+from gsstream.testing.compare import Behaviour, Outputs, Poison, at_most, equal, finite, has_shape, poisons_of
 from gsstream.testing.registry import check
 
 ENOUGH_AUC = 0.9

@@ -13,8 +13,7 @@ from gsstream.core.part import Part
 from gsstream.engine.assembly.part_in_use import line_of
 from gsstream.parts.render.backward import backward
 from gsstream.testing.cases import World, get_case
-from gsstream.testing.compare import all_equal
-from gsstream.testing.drive import Outputs, outputs
+from gsstream.testing.compare import Outputs, all_equal, outputs
 from gsstream.testing.pretend import DEVICE, DeviceMismatch, PretendDevice, PretendUnavailable, require_pretend
 from gsstream.testing.registry import Skip, check, kind_of
 

@@ -8,8 +8,18 @@ import torch
 
 from gsstream.parts.gate.base import AnalyticGate, GateSampler
 from gsstream.testing.cases import World, get_case
-from gsstream.testing.compare import ROUNDING, all_equal, at_most, equal, finite
-from gsstream.testing.drive import Behaviour, Outputs, draw, has_shape, poisons_of
+from gsstream.testing.compare import (
+    ROUNDING,
+    Behaviour,
+    Outputs,
+    all_equal,
+    at_most,
+    draw,
+    equal,
+    finite,
+    has_shape,
+    poisons_of,
+)
 from gsstream.testing.registry import check
 
 DRAWS = 4096

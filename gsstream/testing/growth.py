@@ -8,8 +8,8 @@ from gsstream.core.changes import RowEdit, apply_row_edit
 from gsstream.packet.changes.rows import encode_rows_change
 from gsstream.parts.growth.base import Growth
 from gsstream.testing.cases import fingerprint
+from gsstream.testing.method_driver import check_closed_loop, fit_fixture
 from gsstream.testing.registry import check
-from gsstream.testing.working import check_closed_loop, fit_fixture
 
 
 def _proposed(part: Growth, *, changed: bool = True) -> RowEdit | None:

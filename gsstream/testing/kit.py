@@ -5,25 +5,37 @@ from __future__ import annotations
 import functools
 import importlib
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from gsstream.core.kinds import PART_KINDS
 from gsstream.core.part import Part
+from gsstream.discovery.catalog import Catalog, Entry
+from gsstream.discovery.commands import command_of
 from gsstream.engine.assembly.part_in_use import line_of
 from gsstream.method.base import StreamingMethod
 from gsstream.spec import CommandSpec
 from gsstream.testing import method_driver
-from gsstream.testing.command import CommandUnderTest
+from gsstream.testing.common import imports_torch
 from gsstream.testing.packet import PacketCodec
-from gsstream.testing.recording import SourceUnderTest
-from gsstream.testing.registry import CHECKS, MIN_REASON, Advice, Check, Skip, checks_for, expected_failure_of, kind_of
+from gsstream.testing.registry import (
+    CHECKS,
+    MIN_REASON,
+    Advice,
+    Check,
+    Skip,
+    SourceUnderTest,
+    check,
+    checks_for,
+    expected_failure_of,
+    kind_of,
+)
 
 Status = Literal["passed", "failed", "warning", "expected failure", "skipped"]
-#: Modules of checks: for parts of all kinds, for each kind, for packets, for commands. Importing them fills the
-#: registry, in the order of the reports.
-MODULES = ("common", *PART_KINDS, "packet", "command")
+#: Modules of checks: for parts of all kinds, for each kind, for packets; those for commands are here. Importing them
+#: fills the registry, in the order of the reports.
+MODULES = ("common", *PART_KINDS, "packet")
 for _name in MODULES:
     importlib.import_module(f"gsstream.testing.{_name}")
 
@@ -191,3 +203,38 @@ def summary(results: Sequence[CheckResult]) -> str:
     order: tuple[Status, ...] = ("passed", "failed", "warning", "expected failure", "skipped")
     counts = {status: sum(result.status == status for result in results) for status in order}
     return ", ".join(f"{number} {status}" for status, number in counts.items() if number)
+
+
+class CommandUnderTest:
+    """A declared command; errors name the distribution ``origin``."""
+
+    def __init__(self, spec: CommandSpec, origin: str = "here") -> None:
+        self.spec, self._origin = spec, origin
+
+    def __repr__(self) -> str:
+        return f"command {self.spec.name}"
+
+    def made(self) -> Any:
+        """Return the command that typer makes of the declaration. Raises PluginUnavailable."""
+        entry = Entry(self.spec, self._origin, self._origin, "")
+        return command_of(self.spec, Catalog({("command", self.spec.name): entry}, ()))
+
+
+@check("command")
+def check_command(subject: CommandUnderTest) -> None:
+    """Typer makes a command of it that explains every option; its help begins with its summary and needs no torch."""
+    command = subject.made()
+    first = (command.help or "").strip().splitlines()[:1]
+    assert first == [subject.spec.summary], f"its help begins with {first}, its summary is {subject.spec.summary!r}"
+    silent = [f"{name} {option.name}" for name, option in _options(command) if not getattr(option, "help", None)]
+    assert not silent, f"these options have no help: {', '.join(silent)}"
+    module = subject.spec.target.partition(":")[0]
+    heavy = imports_torch(module)
+    assert not heavy, f"importing {module}, which --help does, imports torch; import it inside the function: {heavy}"
+
+
+def _options(command: Any) -> Iterator[tuple[str, Any]]:
+    """Every option and argument of a command and of those below it."""
+    yield from ((command.name, option) for option in command.params)
+    for below in getattr(command, "commands", {}).values():
+        yield from _options(below)

@@ -23,7 +23,8 @@ from gsstream.testing.cases import SIZE, Scene, fingerprint, get_case
 from gsstream.testing.compare import EXACT, at_most, equal, gradients_equal, relative
 from gsstream.testing.registry import check
 
-#: Of the largest value of a gradient. A renderer may blend what stands still once for all passes of a frame, and then
+#: Tolerance as a share of the largest value of a gradient. A renderer may blend what stands still once for all passes
+#: of a frame, and then
 #: compositing may stop one Gaussian later in a pixel near the transmittance cut-off (docs/results/cost.md).
 NEAR = 5e-3
 WHY = "the same calls, up to rounding and the end of a pixel's light"

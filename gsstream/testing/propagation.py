@@ -9,8 +9,7 @@ import torch
 from gsstream.core.hierarchy import Hierarchy, tree_roots
 from gsstream.parts.propagation.base import Propagation
 from gsstream.testing.cases import World, flat, get_case
-from gsstream.testing.compare import ROUNDING, at_most, equal, finite
-from gsstream.testing.drive import Behaviour, Outputs, poisons_of
+from gsstream.testing.compare import ROUNDING, Behaviour, Outputs, at_most, equal, finite, poisons_of
 from gsstream.testing.registry import check
 
 WORLDS = ("one", "two identical", "coincident", "cloud", "logits of 20", "logits of 100", "huge logits")

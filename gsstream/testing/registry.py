@@ -1,15 +1,19 @@
-"""The list of checks: each registers itself with the kind of part it is for and the trait that calls for it."""
+"""The list of checks: each registers itself with the kind of part it is for and the trait that calls for it.
+
+Sources are functions that open recordings, so there is no part to check: what is checked is a ``SourceUnderTest``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from gsstream.core.errors import SourceError
 from gsstream.core.kinds import CONTRACTS, PART_KINDS
 from gsstream.core.part import Part
-from gsstream.testing.recording import Skip as Skip
-from gsstream.testing.recording import SourceUnderTest
+from gsstream.input.recordings.base import Source
 
 #: Kinds of part on which all common checks are made; on parts of other kinds only those of settings, freezing and
 #: declaration are.
@@ -82,3 +86,37 @@ def expected_failure_of(subject: object) -> dict[str, str]:
         return dict(subject.denials())
     except Exception:  # a part may raise anything; ``check_denials`` reports it
         return {}
+
+
+class Skip(Exception):
+    """Raised by a check that cannot be made here; the message says why. Skips are reported and counted."""
+
+
+class SourceUnderTest:
+    """A part of the kind "source" and the recording that it is checked on.
+
+    Arguments:
+        target: called as ``target(uri, scale)``.
+        uri: the recording; it is opened anew for every check. Keep it small: every check reads some of its frames.
+        given: whether somebody asked for this recording. One that was only guessed and cannot be opened skips checks.
+    """
+
+    def __init__(self, target: Callable[[str, float], Source], uri: str, *, given: bool = True) -> None:
+        self.target, self.uri, self.given = target, uri, given
+
+    def __repr__(self) -> str:
+        return f"source {getattr(self.target, '__name__', self.target)} on {self.uri!r}"
+
+    @contextmanager
+    def open(self, scale: float = 1.0) -> Iterator[Source]:
+        """Open the recording; it is closed when the check is over."""
+        try:
+            source = self.target(self.uri, scale)
+        except SourceError as error:
+            if self.given or scale != 1.0:
+                raise
+            raise Skip(f"needs a recording, give one with --source ({error})") from error
+        try:
+            yield source
+        finally:
+            source.close()

@@ -11,8 +11,7 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.shapes import check_shape
 from gsstream.parts.regularizer.base import AnalyticPenalty, Regularizer
 from gsstream.testing.cases import World, forest, get_case
-from gsstream.testing.compare import ROUNDING, at_most, equal, finite
-from gsstream.testing.drive import Behaviour, Outputs, poisons_of
+from gsstream.testing.compare import ROUNDING, Behaviour, Outputs, at_most, equal, finite, poisons_of
 from gsstream.testing.registry import check
 
 #: Number of rows of a large scene: a sum of so many values in float32, one after another, loses digits.
@@ -110,7 +109,7 @@ def check_regularizer_gradient(part: Regularizer) -> None:
     case = get_case("two identical").double()
     inputs = (torch.tensor([0.3, 0.7], dtype=torch.float64, requires_grad=True), case.residual.requires_grad_(True))
     if not _total(part.penalty(*inputs, case.hierarchy, 2)).requires_grad:
-        return  # it costs nothing, whatever the input
+        return  # the null regularizer costs nothing, whatever the input
     torch.autograd.gradcheck(lambda p, r: _total(part.penalty(p, r, case.hierarchy, 2)), inputs, eps=1e-6, atol=1e-6)
     rest = (torch.zeros_like(inputs[0]).requires_grad_(True), torch.zeros_like(inputs[1]).requires_grad_(True))
     total = _total(part.penalty(*rest, case.hierarchy, 2))

@@ -12,8 +12,7 @@ from gsstream.parts.backend.reference import ALPHA_CUT, project
 from gsstream.parts.render.backward import gradient_of
 from gsstream.parts.render.images import TILE
 from gsstream.parts.render.session import RenderOutput
-from gsstream.testing import change as change
-from gsstream.testing import loss as loss  # the checks of these four register themselves
+from gsstream.testing import loss_and_change as loss_and_change  # the checks of these three register themselves
 from gsstream.testing import loss_and_grad as loss_and_grad
 from gsstream.testing import optimiser as optimiser
 from gsstream.testing.cases import BLACK, RENDERER, SIZE, Scene, fingerprint, get_case

@@ -17,8 +17,7 @@ from gsstream.input.recordings.base import Source, Split, Wrapped
 from gsstream.input.recordings.canonical import CanonicalSource, recording_similarity
 from gsstream.input.recordings.options import DataOptions
 from gsstream.input.recordings.transformed import transformed
-from gsstream.testing.recording import SourceUnderTest
-from gsstream.testing.registry import check
+from gsstream.testing.registry import SourceUnderTest, check
 
 SPLITS: tuple[Split, ...] = ("train", "test")
 THREADS = 4

@@ -12,8 +12,7 @@ from gsstream.core.frame import PointCloud
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.parts.structure.base import Structure
 from gsstream.testing.cases import World, get_case
-from gsstream.testing.compare import finite
-from gsstream.testing.drive import Behaviour, Outputs, poisons_of
+from gsstream.testing.compare import Behaviour, Outputs, finite, poisons_of
 from gsstream.testing.registry import check
 
 WORLDS = ("one", "two identical", "line", "cloud", "far", "tiny", "vast", "thin", "unseen")

@@ -17,7 +17,7 @@ from gsstream.cli.check import Subject, _lines
 from gsstream.cli.main import run_command
 from gsstream.cli.scaffold import STARTABLE
 from gsstream.testing.kit import CheckResult
-from gsstream.testing.working import effect
+from gsstream.testing.method_driver import effect
 
 #: Commands in a process that has a plugin of every kind; what each prints goes with its exit code to one JSON file.
 ALL = """

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsstream.core.changes import RowEdit, add_to_nodes
 from gsstream.testing.examples.growth import ExampleGrowth
-from gsstream.testing.working import INDEX
+from gsstream.testing.method_driver import INDEX
 from saboteurs.register import spoils
 
 Base: Any = ExampleGrowth

@@ -8,9 +8,9 @@ import numpy as np
 
 from gsstream.core.changes import Motion
 from gsstream.parts.motion.base import MotionTraits
-from gsstream.testing import bodies
 from gsstream.testing.examples.motion import ExampleMotion
-from gsstream.testing.working import INDEX
+from gsstream.testing.method_driver import INDEX
+from gsstream.testing.motion import BODIES_INDEX
 from saboteurs.register import spoils
 
 Base: Any = ExampleMotion
@@ -83,7 +83,7 @@ class Sweeping(Base):
     traits = MotionTraits()
 
     def propose(self, scene: Any, work: Any, rng: Any, memory: Any = None) -> Any:
-        if work.index != bodies.INDEX or not bool(work.changed_rows(0.0).any()):
+        if work.index != BODIES_INDEX or not bool(work.changed_rows(0.0).any()):
             return super().propose(scene, work, rng, memory)
         return (everything(len(np.unique((scene.gaussians.means < 0) @ np.array([1, 2, 4])))),)
 

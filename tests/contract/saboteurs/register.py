@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar, final
 
 from gsstream.core.part import Part
-from gsstream.testing.recording import SourceUnderTest
+from gsstream.testing.registry import SourceUnderTest
 
 Saboteur = TypeVar("Saboteur", bound=type)
 

@@ -13,7 +13,7 @@ import numpy as np
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.storage import to_bytes
 from gsstream.testing.examples.source import ExampleSource
-from gsstream.testing.recording import SourceUnderTest
+from gsstream.testing.registry import SourceUnderTest
 from saboteurs.register import spoils
 
 

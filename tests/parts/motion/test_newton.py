@@ -21,7 +21,7 @@ from gsstream.parts.motion.newton import BodySettings, DampedNewton, Damping, fi
 from gsstream.parts.render.transforms import Pinhole, curvature_of
 from gsstream.parts.render.wrt import WrtTransforms
 from gsstream.testing.cases import get_case
-from gsstream.testing.working import FitFixture, fit_fixture
+from gsstream.testing.method_driver import FitFixture, fit_fixture
 
 FREE = Damping(0.0, 1e-9, 1e9)
 

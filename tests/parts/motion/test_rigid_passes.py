@@ -22,8 +22,7 @@ from gsstream.parts.backend.change import Change, find_change
 from gsstream.parts.motion.groups import pixel_size
 from gsstream.parts.motion.rigid import Rigid
 from gsstream.parts.render.wrt import WrtRows
-from gsstream.testing.method_driver import SOURCE
-from gsstream.testing.working import FitFixture, fit_fixture, method_with
+from gsstream.testing.method_driver import SOURCE, FitFixture, fit_fixture, method_with
 
 
 def near_by_hand(tiles: np.ndarray) -> np.ndarray:

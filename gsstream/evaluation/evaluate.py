@@ -24,9 +24,9 @@ from gsstream.metrics import (
     changed_mask,
     moving_mask,
     noise_sigma,
+    picture_quality,
     psnr,
     slope_per_100,
-    ssim,
 )
 from gsstream.packet import PacketKind
 from gsstream.player.playback import Playback
@@ -259,21 +259,16 @@ def _compare(
     frame: int, name: str, pair: ViewPair, held: FloatArray, masks: tuple[Any, Any], lpips: OnnxLpips | None
 ) -> ViewQuality:
     """``masks``: moving pixels, changed pixels."""
-    image, truth, (moving, changed) = pair.image, pair.truth, masks
-    distances = () if lpips is None else (lpips(image, truth), lpips(held, truth))
+    truth, (moving, changed) = pair.truth, masks
+    shown, still = (picture_quality(image, truth, moving, changed=changed) for image in (pair.image, held))
     return ViewQuality(
-        frame,
-        name,
-        psnr(image, truth),
-        ssim(image, truth),
-        psnr(image, truth, moving),
-        float(moving.mean()),
-        psnr(held, truth),
-        ssim(held, truth),
-        psnr(held, truth, moving),
-        psnr(image, truth, changed),
-        psnr(held, truth, changed),
-        *distances,
+        frame=frame,
+        camera=name,
+        moving_share=float(moving.mean()),
+        lpips=math.nan if lpips is None else lpips(pair.image, truth),
+        static_lpips=math.nan if lpips is None else lpips(held, truth),
+        **shown._asdict(),
+        **{f"static_{key}": value for key, value in still._asdict().items()},
     )
 
 

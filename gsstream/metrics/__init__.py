@@ -8,10 +8,11 @@ from gsstream.metrics.moving import flicker as flicker
 from gsstream.metrics.moving import moving_mask as moving_mask
 from gsstream.metrics.moving import psnr_moving as psnr_moving
 from gsstream.metrics.noise import noise_sigma as noise_sigma
-from gsstream.metrics.psnr import psnr as psnr
-from gsstream.metrics.ssim import MS_SSIM_VARIANT as MS_SSIM_VARIANT
-from gsstream.metrics.ssim import SSIM_VARIANT as SSIM_VARIANT
-from gsstream.metrics.ssim import ms_ssim as ms_ssim
-from gsstream.metrics.ssim import ssim as ssim
+from gsstream.metrics.picture_quality import MS_SSIM_VARIANT as MS_SSIM_VARIANT
+from gsstream.metrics.picture_quality import SSIM_VARIANT as SSIM_VARIANT
+from gsstream.metrics.picture_quality import ms_ssim as ms_ssim
+from gsstream.metrics.picture_quality import picture_quality as picture_quality
+from gsstream.metrics.picture_quality import psnr as psnr
+from gsstream.metrics.picture_quality import ssim as ssim
 from gsstream.metrics.trend import peak_memory_mb as peak_memory_mb
 from gsstream.metrics.trend import slope_per_100 as slope_per_100

@@ -7,7 +7,7 @@ import numpy as np
 from gsstream.core.errors import PluginUnavailable
 from gsstream.core.install_hints import install_extra
 from gsstream.core.shapes import FloatArray
-from gsstream.metrics.psnr import check_pair
+from gsstream.metrics.picture_quality import check_pair
 
 FLIP_VARIANT = "LDR-FLIP, 67 pixels per degree, mean (flip-evaluator)"
 _PIXELS_PER_DEGREE = 67.0206

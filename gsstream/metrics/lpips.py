@@ -13,7 +13,7 @@ import numpy as np
 from gsstream.core.errors import InputError, ShapeError
 from gsstream.core.install_hints import install_extra, page
 from gsstream.core.shapes import FloatArray
-from gsstream.metrics.psnr import check_pair
+from gsstream.metrics.picture_quality import check_pair
 
 #: Metadata key of the ONNX file that says where the range of its inputs begins.
 RANGE_KEY = "gsstream.lpips.range"

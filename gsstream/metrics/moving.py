@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from gsstream.core.shapes import FloatArray
-from gsstream.metrics.psnr import Mask, check_pair, psnr
+from gsstream.metrics.picture_quality import Mask, check_pair, psnr
 
 #: Least difference that counts as motion, [0, 1] units, and the width of the rim added around it, pixels.
 FLOOR, DILATION = 6 / 255, 2

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsstream.core.median import median
 from gsstream.core.shapes import FloatArray
-from gsstream.metrics.psnr import check_pair
+from gsstream.metrics.picture_quality import check_pair
 
 #: Standard deviation of a normal variable over its median absolute deviation.
 MAD_TO_SIGMA = 1.4826

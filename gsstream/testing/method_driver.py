@@ -29,7 +29,7 @@ from gsstream.engine.run.player_difference import difference_between
 from gsstream.engine.step.context import EngineContext
 from gsstream.input.recordings.open import open_source
 from gsstream.method.base import StreamingMethod
-from gsstream.metrics.psnr import psnr
+from gsstream.metrics.picture_quality import psnr
 from gsstream.packet import PlayerState, decode_packet
 from gsstream.parts.backend.change import Change, find_change
 from gsstream.player.render import named_renderer, render

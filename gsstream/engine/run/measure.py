@@ -11,7 +11,8 @@ import torch
 
 from gsstream.core.frame import Frame
 from gsstream.core.shapes import FloatArray
-from gsstream.metrics import changed_mask, moving_mask, noise_sigma, psnr, ssim
+from gsstream.metrics import changed_mask, moving_mask, noise_sigma, picture_quality, psnr
+from gsstream.metrics.picture_quality import PictureQuality
 from gsstream.packet import PlayerState
 from gsstream.parts.backend.base import Renderer
 
@@ -39,14 +40,14 @@ class HeldOut:
             self._first = frame
         elif not self._sigma:
             self._sigma = _noise(self._first, frame)
-        out: dict[str, Any] = {"psnr": {}, "ssim": {}, "psnr_moving": {}, "psnr_changed": {}}
+        out: dict[str, Any] = {name: {} for name in PictureQuality._fields}
         for view, name in enumerate(frame.cameras.ids):
             image = self.render(player, frame, view)
             truth, first = frame.image(view), self._first.image(view)
-            out["psnr"][name] = _finite(psnr(image, truth))
-            out["ssim"][name] = _finite(ssim(image, truth))
-            out["psnr_moving"][name] = self._moving(image, truth, first, view)
-            out["psnr_changed"][name] = _finite(psnr(image, truth, changed_mask(truth, first)))
+            moving = moving_mask(truth, first, self._sigma[view]) if self._sigma else np.zeros(truth.shape[:2], bool)
+            quality = picture_quality(image, truth, moving, changed=changed_mask(truth, first))
+            for key, value in quality._asdict().items():
+                out[key][name] = value if math.isfinite(value) else None
         return out
 
     def doubt(self, player: PlayerState, train: Frame, measured: Mapping[str, float | None]) -> str:
@@ -77,16 +78,7 @@ class HeldOut:
             output = self._renderer.render(gaussians, frame.cameras, view, background)
         return np.asarray(np.clip(output.image.numpy(), 0, 1))
 
-    def _moving(self, image: FloatArray, truth: FloatArray, first: FloatArray, view: int) -> float | None:
-        if not self._sigma:
-            return None
-        return _finite(psnr(image, truth, moving_mask(truth, first, self._sigma[view])))
-
 
 def _noise(first: Frame, second: Frame) -> list[float]:
     """Noise of every camera, image units."""
     return [noise_sigma(first.image(view), second.image(view)) for view in range(len(first.cameras))]
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

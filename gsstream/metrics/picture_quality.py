@@ -1,16 +1,17 @@
-"""Structural similarity: the variant of the Gaussian-splatting papers, those of the libraries, and multi-scale."""
+"""How near a picture comes to another: PSNR and SSIM, on all pixels, on those that moved and on those that changed."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from gsstream.core.errors import ShapeError
-from gsstream.core.shapes import FloatArray
-from gsstream.metrics.psnr import check_pair
+from gsstream.core.shapes import BoolArray, FloatArray
 
+Mask = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 #: Printed in every table: SSIM variants differ by up to 0.02.
 SSIM_VARIANT = "SSIM 11x11 Gaussian 1.5, zero padding, mean over channels (3DGS)"
 MS_SSIM_VARIANT = "MS-SSIM 5 scales, 11x11 Gaussian 1.5, valid region, mean over channels (Wang 2003)"
@@ -22,6 +23,27 @@ Border = Literal["zero", "reflect", "valid"]
 _BAND = 64
 #: Exponents of the scales, finest first (Wang, Simoncelli, Bovik 2003).
 _SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+
+
+def psnr(image: FloatArray, target: FloatArray, mask: Mask | None = None) -> float:
+    """Return -10 log10 of the mean squared error of one image, dB; inf for equal ones, nan for an empty mask."""
+    check_pair(image, target)
+    error: FloatArray = np.subtract(image, target, dtype=np.float64)
+    np.square(error, out=error)
+    if mask is not None:
+        if mask.shape != error.shape[:2]:
+            raise ShapeError(f"mask: expected {list(error.shape[:2])}, got {list(mask.shape)}")
+        error = error[mask]
+    if error.size == 0:
+        return math.nan
+    mean = float(error.mean())
+    return math.inf if mean == 0 else -10 * math.log10(mean)
+
+
+def check_pair(image: FloatArray, target: FloatArray) -> None:
+    """Raise ShapeError unless both are [H, W, 3] of one size."""
+    if image.shape != target.shape or image.ndim != 3 or image.shape[2] != 3:
+        raise ShapeError(f"expected two [H, W, 3] images of one size, got {list(image.shape)} and {list(target.shape)}")
 
 
 def ssim(image: FloatArray, target: FloatArray, border: Border = "zero") -> float:
@@ -121,3 +143,24 @@ def _blur(image: FloatArray) -> FloatArray:
 
 def _window(image: FloatArray, axis: int, start: int, size: int) -> FloatArray:
     return image[start : start + size] if axis == 0 else image[:, start : start + size]
+
+
+class PictureQuality(NamedTuple):
+    """Qualities of one picture; PSNR in dB, nan where a mask holds no pixel."""
+
+    psnr: float
+    ssim: float
+    psnr_moving: float
+    psnr_changed: float
+
+
+def picture_quality(image: FloatArray, truth: FloatArray, moving: BoolArray, *, changed: BoolArray) -> PictureQuality:
+    """Compare an image [H, W, 3] in [0, 1] with the recorded one.
+
+    Arguments:
+        image, truth: [H, W, 3] in [0, 1].
+        moving, changed: [H, W] bool, pixels of :func:`moving_mask` and of :func:`changed_mask`.
+    """
+    return PictureQuality(
+        psnr(image, truth), ssim(image, truth), psnr(image, truth, moving), psnr(image, truth, changed)
+    )

@@ -11,14 +11,16 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
-#: The phases of a frame, in the order in which tables list them. "failed" is time whose result was thrown away.
+from gsstream.core.kinds import FITTING_SLOTS
+
+#: The phases of a frame, in the order in which tables list them: each kind of part that fits changes by itself has one.
+#: "failed" is time whose result was thrown away.
 PHASES = (
     "seed",
     "change",
-    "motion",
+    *FITTING_SLOTS,
     "confidence",
     "optimise",
-    "growth",
     "code",
     "keep",
     "key",

@@ -16,7 +16,7 @@ from gsstream.engine.assembly.checks import Checks, requested_checks
 from gsstream.engine.assembly.choose_renderer import Chosen, choose_renderer, construct
 from gsstream.engine.assembly.guard import guard
 from gsstream.engine.assembly.part_in_use import PartInUse, Where
-from gsstream.engine.assembly.recipe_keys import unused_keys
+from gsstream.engine.assembly.recipe_keys import unused_key_messages
 from gsstream.engine.assembly.slots import SLOTS, LiveParts
 from gsstream.engine.assembly.title import title
 from gsstream.recipe.check import join_problems, validate
@@ -110,8 +110,7 @@ def assemble(
     if on_gpu and (reason := _processor_only(parts)):
         problems.append(f"renderer {refs['renderer'].name!r} works on a GPU, and {reason}; choose --renderer cpu")
     if "streaming_method" in parts:
-        paths = list(unused_keys(resolved.recipe.model_copy(update=refs), parts["streaming_method"], parts))
-        problems += _unused_key_messages(paths, resolved)
+        problems += unused_key_messages(resolved.recipe.model_copy(update=refs), parts, resolved)
     join_problems(problems)
     declared = (catalog.entries.get((slot, ref.name)) for slot, ref in refs.items())
     owners = sorted({entry.distribution for entry in declared if entry})
@@ -126,23 +125,6 @@ def assemble(
         **parts,
         background=BLACK if recipe.background == "auto" else recipe.background,
     )
-
-
-def _unused_key_messages(paths: list[KeyPath], resolved: ResolvedRecipe) -> list[str]:
-    """Return messages about keys that the method does not read: one each, or one line where most come from its base."""
-    name, base = resolved.recipe.streaming_method.name, resolved.recipe.method
-    from_base = [path for path in paths if resolved.near(path).label == f"method {base}"]
-    if len(from_base) > 2:
-        where = resolved.near(("streaming_method", "name")).where
-        some = ", ".join(".".join(path) for path in from_base[:3])
-        return [
-            f"{where}: the streaming_method {name!r} reads none of {len(from_base)} settings that the method {base!r} "
-            f"brings ({some}, ...); put it in place of another method: --method dense --set streaming_method={name}"
-        ]
-    hint = f"the streaming_method {name!r} does not read it; its own settings: gsstream plugins streaming_method/{name}"
-    if name == "parts":  # which reads every key, but for those of a residual that is never sent
-        hint = f"nothing reads it, because the update {resolved.recipe.update.name!r} sends no residual"
-    return [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]
 
 
 def with_values(params: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:

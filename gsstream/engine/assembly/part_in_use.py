@@ -59,8 +59,9 @@ class PartInUse:
     def errors(self) -> Iterator[None]:
         """Turn an error of the part into a ComponentError with slot, part, distribution, frame and iteration.
 
-        A ShapeError is turned, too: it says that this part refuses what another part gave it. Of a renderer so is every
-        InputError, because a renderer is given nothing but arrays. Other errors of gsstream pass unchanged.
+        A ShapeError is turned, too: it says that this part refuses what another part gave it. Every InputError of a
+        renderer is turned, too, because a renderer is given nothing but arrays. Other errors of gsstream pass
+        unchanged.
         """
         try:
             with named_checks(self._named):

@@ -8,6 +8,7 @@ from typing import Any
 from gsstream.core.kinds import METHOD_SLOTS
 from gsstream.method.base import StreamingMethod
 from gsstream.recipe.document import KeyPath
+from gsstream.recipe.load import ResolvedRecipe
 from gsstream.recipe.model import Recipe
 
 #: Sections that, beside the slots of parts, only a method made of parts reads.
@@ -19,6 +20,30 @@ RESIDUAL_KEYS = (
     "confidence", "propagation", "gate", "regularizer", "stream.epochs", "stream.lr_final_factor",
     "stream.active_threshold", "stream.rd_lambda", "stream.progressive",
 )  # fmt: skip
+
+
+def unused_key_messages(recipe: Recipe, parts: Mapping[str, Any], resolved: ResolvedRecipe) -> list[str]:
+    """Return messages about keys that the method does not read: one each, or one line where most come from its base.
+
+    Arguments:
+        recipe: the recipe with the settings of all parts written out.
+        parts: slot -> part, that of the streaming method included.
+        resolved: the recipe as it was written, which knows where its values come from.
+    """
+    paths = list(unused_keys(recipe, parts["streaming_method"], parts))
+    name, base = resolved.recipe.streaming_method.name, resolved.recipe.method
+    from_base = [path for path in paths if resolved.near(path).label == f"method {base}"]
+    if len(from_base) > 2:
+        where = resolved.near(("streaming_method", "name")).where
+        some = ", ".join(".".join(path) for path in from_base[:3])
+        return [
+            f"{where}: the streaming_method {name!r} reads none of {len(from_base)} settings that the method {base!r} "
+            f"brings ({some}, ...); put it in place of another method: --method dense --set streaming_method={name}"
+        ]
+    hint = f"the streaming_method {name!r} does not read it; its own settings: gsstream plugins streaming_method/{name}"
+    if name == "parts":  # which reads every key, but for those of a residual that is never sent
+        hint = f"nothing reads it, because the update {resolved.recipe.update.name!r} sends no residual"
+    return [f"{resolved.near(path).where}: {'.'.join(path)}: {hint}" for path in paths]
 
 
 def unused_keys(recipe: Recipe, method: StreamingMethod[Any], parts: Mapping[str, Any]) -> Iterator[KeyPath]:

@@ -48,7 +48,7 @@ class EngineContext:
         self._assembly, device = assembly, assembly.renderer.device
         resident = state.resident
         if resident is None:
-            gaussians = state.gaussians.map(lambda value: value.to(device))
+            gaussians = state.player.gaussians.map(lambda value: torch.from_numpy(value).to(device))
             resident = Resident(gaussians, state.hierarchy.to(device), state.shown(device))
         self.gaussians, self.hierarchy, self.previous_images = resident
         self.index, self.cameras = frame.index, frame.cameras
@@ -163,7 +163,8 @@ class EngineContext:
         return self.view_target(view, self._change.dilated[view].float().clamp_min(far))
 
     def residual_target(self, view: int) -> ViewTarget:
-        """Return what the residual's render of this view is compared with; the larger the picture, the less of it.
+        """Return what the residual's render of this view is compared with; the larger the picture, the less tiles away
+        from every change weigh.
 
         :func:`gsstream.core.picture_size.far_weight` is the rule, docs/results/extremes.md what was measured.
         """

@@ -15,29 +15,28 @@ from gsstream.parts.render.session import RenderCache, RenderSession
 
 def step_numbers(solution: Solution | None, candidates: int, session: RenderSession | None) -> dict[str, Any]:
     """Return what the optimisation did (None: there was none), and what the renderer keeps for the next frame."""
-    return {
+    numbers = {
         "dead_gates": 0 if solution is None else solution.dead_gates,
         "open_gates": [] if solution is None else list(solution.open_gates),
         "candidate_gaussians": candidates,
         "loss": 0.0 if solution is None else solution.loss,
         "iterations": 0 if solution is None else solution.iterations,
-        **_cache(session),
     }
-
-
-def _cache(session: RenderSession | None) -> dict[str, Any]:
     cache = RenderCache() if session is None else session.cache_bytes()
-    if not cache.per_view:
-        return {}
-    per_pair = round(cache.per_camera_and_gaussian, 1)
-    known = {"mb": cache.total / 1e6, "cameras": len(cache.per_view), "bytes_per_camera_and_gaussian": per_pair}
-    return {"cache": known}
+    if cache.per_view:
+        per_pair = round(cache.per_camera_and_gaussian, 1)
+        numbers["cache"] = {
+            "mb": cache.total / 1e6,
+            "cameras": len(cache.per_view),
+            "bytes_per_camera_and_gaussian": per_pair,
+        }
+    return numbers
 
 
 def log_packet(log: FrameLog, player: PlayerState, packet: EncodedPacket) -> None:
     """Log the sizes and counts that follow from a packet and the state it was decoded to.
 
-    Of a key packet that takes the place of a delta packet only sizes are logged; the counts stay those of the delta
+    Where a key packet takes the place of a delta packet, only its sizes are logged: the counts stay those of the delta
     packet.
     """
     sizes = {

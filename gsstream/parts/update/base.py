@@ -81,17 +81,17 @@ def quantise_latents(
 
     Raises ShapeError for latents that are not finite or beyond MAX_SYMBOL steps, whose integers would be arbitrary.
     """
-    return {name: _integers(name, value.detach() / codes[name].step) for name, value in latents.items()}
-
-
-def _integers(name: str, scaled: torch.Tensor) -> torch.Tensor:
-    rounded = torch.round(scaled)
-    bad = ~(rounded.abs() <= MAX_SYMBOL)
-    if bool(bad.any()):
-        row, channel = bad.nonzero()[0].tolist()
-        raise ShapeError(
-            f"latents of {name}: expected at most {MAX_SYMBOL} quantisation steps, got {float(scaled[row, channel]):g} "
-            f"in row {row}, channel {channel} ({int(bad.sum())} of {bad.numel()} values); the optimisation has "
-            "diverged, lower its learning rate"
-        )
-    return rounded.to(torch.int32)
+    symbols = {}
+    for name, value in latents.items():
+        scaled = value.detach() / codes[name].step
+        rounded = torch.round(scaled)
+        bad = ~(rounded.abs() <= MAX_SYMBOL)
+        if bool(bad.any()):
+            row, channel = bad.nonzero()[0].tolist()
+            raise ShapeError(
+                f"latents of {name}: expected at most {MAX_SYMBOL} quantisation steps, got "
+                f"{float(scaled[row, channel]):g} in row {row}, channel {channel} ({int(bad.sum())} of {bad.numel()} "
+                "values); the optimisation has diverged, lower its learning rate"
+            )
+        symbols[name] = rounded.to(torch.int32)
+    return symbols

@@ -63,7 +63,7 @@ def _base_points(source: Source | None, frame: Frame, settings: FirstFrame, tell
 
 
 def _triangulate(frame: Frame, tell: Tell) -> PointCloud:
-    from gsstream.input.seeds.sfm import triangulate_points
+    from gsstream.input.seeds.mapping import triangulate_points
 
     return triangulate_points(frame.images, frame.cameras, tell=tell)
 

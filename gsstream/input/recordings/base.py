@@ -69,9 +69,8 @@ class Moment:
 class Source(ABC):
     """A recording. Reading a frame twice gives the same bits, from any thread.
 
-    A subclass writes ``info`` and ``frame``; every other method has a default. A source that reads one camera's image
-    without the others writes ``image`` too, and one whose files hold 8 bits ``stored_image`` and ``stored_frame``
-    (:func:`assembled` makes frames of single images).
+    A subclass writes ``info`` and ``frame``; every other method has a default. One that reads one camera's image
+    without the others is a :class:`CameraSource`.
     """
 
     @property
@@ -137,6 +136,26 @@ class Source(ABC):
 
     def close(self) -> None:  # noqa: B027  # most recordings keep nothing open
         """Release files and threads."""
+
+
+class CameraSource(Source):
+    """A source that reads one camera's image at a time: a subclass writes ``info`` and ``stored_image``."""
+
+    def frame(self, index: int, split: Split = "train") -> Frame:
+        """Read one instant. Raises SourceError naming the file when a picture is missing or damaged."""
+        return self.stored_frame(index, split).as_float32()
+
+    def image(self, index: int, camera: str) -> FloatArray:
+        """Return one camera's image [H, W, 3] float32 in [0, 1]."""
+        return unpacked(self.stored_image(index, camera))
+
+    def stored_frame(self, index: int, split: Split = "train") -> Frame:
+        """Read one instant as it is stored."""
+        return assembled(self, index, split)
+
+    @abstractmethod
+    def stored_image(self, index: int, camera: str) -> Any:
+        """Return one camera's image as uint8, of which 255 is 1.0, where that holds it; else float32."""
 
 
 class Wrapped(Source):

@@ -58,11 +58,6 @@ class Calibration:
     lenses: dict[str, Lens]  # camera id -> its distortion, where it has any
     sizes: dict[str, tuple[int, int]]  # camera id -> (width, height)
 
-    @property
-    def is_raw(self) -> bool:
-        """Whether pictures have to be made of what is stored: of videos, or of pictures that a lens has bent."""
-        return bool(self.lenses) or any(map(is_video, self.patterns.values()))
-
 
 def read_calibration(folder: Path, *, growing: bool = False, any_sizes: bool = False) -> Calibration:
     """Read and check ``folder/cameras.json``.

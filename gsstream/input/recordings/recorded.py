@@ -11,11 +11,11 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError, SourceError
-from gsstream.core.frame import Frame, PointCloud
+from gsstream.core.frame import PointCloud
 from gsstream.core.names import check_camera_ids
-from gsstream.core.shapes import BoolArray, FloatArray
+from gsstream.core.shapes import BoolArray
 from gsstream.core.storage import packed, to_bytes, unpacked
-from gsstream.input.recordings.base import PointKind, Source, SourceInfo, Split, assembled, check_index
+from gsstream.input.recordings.base import CameraSource, PointKind, SourceInfo, check_index
 from gsstream.input.recordings.clips import Clip, prepare_command
 from gsstream.input.recordings.depth_maps import FOLDER
 from gsstream.input.recordings.images import scaled_size
@@ -50,7 +50,7 @@ class Recording:
     folder: Path | None = None  # the recording's, in which it may keep what else is known of frame 0
 
 
-class RecordedSource(Source):
+class RecordedSource(CameraSource):
     """Frames of a :class:`Recording`, area-averaged to ``scale``. Thread-safe.
 
     Cameras with distortion are resampled on reading, to the widest pinhole image without empty corners; ``info`` holds
@@ -90,14 +90,6 @@ class RecordedSource(Source):
         """What the recording says about itself; cameras at the size that ``frame`` delivers."""
         return self._info
 
-    def frame(self, index: int, split: Split = "train") -> Frame:
-        """Read one instant. Raises SourceError naming the file when a picture is missing or damaged."""
-        return self.stored_frame(index, split).as_float32()
-
-    def image(self, index: int, camera: str) -> FloatArray:
-        """Return one camera's image [H, W, 3] float32 in [0, 1]."""
-        return unpacked(self.stored_image(index, camera))
-
     def stored_image(self, index: int, camera: str) -> Any:
         """Return one camera's image as it is stored; an undistorted one has the levels of the picture it is made of."""
         check_index(self._info, index)
@@ -106,10 +98,6 @@ class RecordedSource(Source):
             return packed(image)
         flat = self._undistort[camera].apply(unpacked(image))
         return to_bytes(flat) if image.dtype == np.uint8 else packed(flat)
-
-    def stored_frame(self, index: int, split: Split = "train") -> Frame:
-        """Read one instant as it is stored."""
-        return assembled(self, index, split)
 
     @property
     def stores_bytes(self) -> bool:

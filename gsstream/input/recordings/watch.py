@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from gsstream.core.errors import EndOfRecording, SourceError
-from gsstream.core.frame import Arrival, Frame, PointCloud
-from gsstream.core.shapes import FloatArray
-from gsstream.core.storage import packed, unpacked
-from gsstream.input.recordings.base import Moment, PointKind, Source, SourceInfo, Split, assembled
+from gsstream.core.frame import Arrival, PointCloud
+from gsstream.core.storage import packed
+from gsstream.input.recordings.base import CameraSource, Moment, PointKind, SourceInfo
 from gsstream.input.recordings.calibration import CALIBRATION_FILE, Calibration, is_video, read_calibration
 from gsstream.input.recordings.depth_maps import FOLDER
 from gsstream.input.recordings.images import read_stored, scaled_size
@@ -39,9 +38,11 @@ class _Plan:
 _WHOLE = _Plan()
 
 
-class WatchSource(Source):
+class WatchSource(CameraSource):
     """Frames of a growing folder in the layout of cameras.json. ``frame`` waits until the frame is there.
 
+    EndOfRecording is raised where the recording ended before it. Test cameras are left out of a frame in which one of
+    them is absent, so that nothing is measured against an image of another time.
     A frame once delivered never changes: a file that is written again later is not read again. ``info.uri`` is the
     folder: streams name the recording, not how it was followed. Raises SourceError for a faulty calibration.
     """
@@ -87,28 +88,12 @@ class WatchSource(Source):
         """What is known so far: ``num_frames`` is None until it is declared or the end has been seen."""
         return self._info
 
-    def frame(self, index: int, split: Split = "train") -> Frame:
-        """Wait for one instant and read it.
-
-        Raises EndOfRecording when the recording ended before it. Test cameras are left out of a frame in which one of
-        them is absent, so that nothing is measured against an image of another time.
-        """
-        return self.stored_frame(index, split).as_float32()
-
-    def image(self, index: int, camera: str) -> FloatArray:
-        """Wait for one instant and read one camera's image, or its last one where it is absent."""
-        return unpacked(self.stored_image(index, camera))
-
     def stored_image(self, index: int, camera: str) -> Any:
         """Wait for one instant and read one camera's image as it is stored, or its last one where it is absent."""
         shown = dict(self._plan(index).held).get(camera, index)
         # The image as it was decoded to see whether it is whole; where it is no longer held, it is read again.
         ready = self._decoded.get((camera, shown))
         return self._read(camera, shown) if ready is None else ready
-
-    def stored_frame(self, index: int, split: Split = "train") -> Frame:
-        """Wait for one instant and read it as it is stored."""
-        return assembled(self, index, split)
 
     @property
     def stores_bytes(self) -> bool:

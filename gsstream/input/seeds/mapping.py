@@ -12,9 +12,10 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
+from gsstream.core.frame import PointCloud
 from gsstream.core.install_hints import page
 from gsstream.core.progress import Tell, silent
-from gsstream.core.shapes import BoolArray, FloatArray, IntArray
+from gsstream.core.shapes import BoolArray, FloatArray, IntArray, check_finite, check_shape
 from gsstream.input.recordings.lens import Lens, from_colmap
 from gsstream.input.seeds.sfm import run_pycolmap, write_images, write_rig
 
@@ -105,6 +106,27 @@ def triangulate(images: FloatArray, cameras: Cameras, *, timeout: float = 1800.0
         with np.load(folder / "points.npz") as result:
             found = dict(result)
     return _mapping(found, cameras.viewmats, cameras.Ks, (Lens("radial", ()),) * len(cameras))
+
+
+def triangulate_points(
+    images: FloatArray, cameras: Cameras, *, max_error: float = 2.0, timeout: float = 900.0, tell: Tell = silent
+) -> PointCloud:
+    """Match SIFT features between all pairs of training images and triangulate them with the given poses.
+
+    Returns points in scene units with the mean colour of their features. The same input gives the same points.
+    Raises InputError when pycolmap is not installed, when the process fails, and when nothing could be triangulated.
+    """
+    check_shape("images", images, (len(cameras), cameras.height, cameras.width, 3))
+    check_finite("images", images)
+    found = triangulate(images, cameras, timeout=timeout, tell=tell)
+    keep = np.isfinite(found.xyz).all(1) & (found.error <= max_error)
+    if not keep.any():
+        raise InputError(
+            f"structure from motion found no points in {len(cameras)} training images of {cameras.width} x "
+            f"{cameras.height}: check the poses (world-to-camera, OpenCV axes), or use larger images"
+        )
+    colors = found.rgb[keep].astype(np.float32) / np.float32(255)
+    return PointCloud(found.xyz[keep].astype(np.float32), colors, f"triangulated from {len(cameras)} training images")
 
 
 def _mapping(found: dict[str, Any], viewmats: FloatArray, Ks: FloatArray, lenses: tuple[Lens, ...]) -> Mapping:

@@ -1,4 +1,4 @@
-"""Sparse points of frame 0 by triangulation with the known poses; training images only. Needs ``gsstream[sfm]``."""
+"""Structure from motion in a process of its own: what goes in, and how it runs. Needs ``gsstream[sfm]``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import os
 import re
 import subprocess
 import sys
-import tempfile
 import threading
 from collections.abc import Iterable
 from pathlib import Path
@@ -17,39 +16,9 @@ from PIL import Image
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import InputError
-from gsstream.core.frame import PointCloud
 from gsstream.core.install_hints import install_extra
 from gsstream.core.progress import Tell, silent
-from gsstream.core.shapes import FloatArray, check_finite, check_shape
-
-
-def triangulate_points(
-    images: FloatArray, cameras: Cameras, *, max_error: float = 2.0, timeout: float = 900.0, tell: Tell = silent
-) -> PointCloud:
-    """Match SIFT features between all pairs of training images and triangulate them with the given poses.
-
-    Runs in a process of its own, so that an abort inside the native library does not take this one down.
-
-    Returns points in scene units with the mean colour of their features. The same input gives the same points.
-    Raises InputError when pycolmap is not installed, when the process fails, and when nothing could be triangulated.
-    """
-    check_shape("images", images, (len(cameras), cameras.height, cameras.width, 3))
-    check_finite("images", images)
-    with tempfile.TemporaryDirectory(prefix="gsstream-sfm-") as name:
-        folder = Path(name)
-        write_images(folder, images)
-        write_rig(folder, cameras)
-        run_pycolmap("triangulate", folder, timeout, tell)
-        with np.load(folder / "points.npz") as result:
-            keep = np.isfinite(result["xyz"]).all(1) & (result["error"] <= max_error)
-            xyz, rgb = result["xyz"][keep], result["rgb"][keep]
-    if len(xyz) == 0:
-        raise InputError(
-            f"structure from motion found no points in {len(cameras)} training images of {cameras.width} x "
-            f"{cameras.height}: check the poses (world-to-camera, OpenCV axes), or use larger images"
-        )
-    colors = rgb.astype(np.float32) / np.float32(255)
-    return PointCloud(xyz.astype(np.float32), colors, f"triangulated from {len(cameras)} training images")
+from gsstream.core.shapes import FloatArray
 
 
 def write_images(folder: Path, images: Iterable[FloatArray]) -> None:

@@ -26,7 +26,7 @@ from gsstream.input.recordings.open import open_source
 from gsstream.input.recordings.pointfiles import read_points
 from gsstream.input.recordings.primitives import cast
 from gsstream.input.recordings.synthetic import SyntheticSource
-from gsstream.input.seeds import sfm
+from gsstream.input.seeds import mapping, sfm
 from gsstream.input.seeds.geometry import pixel_centers
 from gsstream.input.seeds.seeding import photo_consistent_seeds
 from gsstream.input.seeds.sweep import SweepSettings
@@ -165,7 +165,7 @@ needs_pycolmap = pytest.mark.skipif(importlib.util.find_spec("pycolmap") is None
 def test_points_lie_on_the_true_surfaces_and_repeat() -> None:
     source = SyntheticSource.from_query("width=320&height=240&views=8")
     images, cameras = source.frame(0).images, source.info.train
-    points = sfm.triangulate_points(images, cameras)
+    points = mapping.triangulate_points(images, cameras)
     assert len(points) > 80
     shapes = source._static + source._scene.moving(0)
     error = np.full(len(points), np.inf)
@@ -175,7 +175,7 @@ def test_points_lie_on_the_true_surfaces_and_repeat() -> None:
     assert np.median(error) < 0.005
     assert (error < 0.03).mean() > 0.9
     assert 0 < points.rgb.mean() < 1
-    assert sfm.triangulate_points(images, cameras).xyz.tobytes() == points.xyz.tobytes()
+    assert mapping.triangulate_points(images, cameras).xyz.tobytes() == points.xyz.tobytes()
 
 
 @pytest.mark.sfm
@@ -232,7 +232,7 @@ def test_linear_algebra_takes_one_thread_whatever_the_environment_says() -> None
 def test_images_without_features_are_explained() -> None:
     source = SyntheticSource.from_query("width=64&height=48&views=3")
     with pytest.raises(InputError, match="found no points in 3 training images of 64 x 48"):
-        sfm.triangulate_points(np.full((3, 48, 64, 3), 0.5, np.float32), source.info.train)
+        mapping.triangulate_points(np.full((3, 48, 64, 3), 0.5, np.float32), source.info.train)
 
 
 @pytest.mark.sfm
@@ -268,7 +268,7 @@ def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     source = SyntheticSource.from_query("width=16&height=16&views=3")
     with pytest.raises(InputError, match=r"pip install 'gsstream\[sfm\]'"):
-        sfm.triangulate_points(source.frame(0).images, source.info.train)
+        mapping.triangulate_points(source.frame(0).images, source.info.train)
 
 
 @pytest.mark.sfm

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import itertools
 import re
 import shlex
@@ -154,8 +155,8 @@ def clip_at(place: Path) -> Clip | None:
     """Return the pictures of a folder, or the video that is called so, whatever its suffix; None where neither is."""
     if images_in(place):
         return folder_clip(place)
-    videos = [path for path in files_in(place.parent, VIDEO_SUFFIXES) if path.stem == place.name]
-    return VideoClip(videos[0]) if videos else None
+    named = sorted(path for path in place.parent.glob(f"{glob.escape(place.name)}.*") if path.stem == place.name)
+    return next((VideoClip(path) for path in named if path.suffix.lower() in VIDEO_SUFFIXES), None)
 
 
 def listed_clips(pictures: Mapping[str, Sequence[Path]]) -> dict[str, Clip]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from scenes import LAYOUTS, SIZE, World, make_world, write_enerf
 from test_rigs import FORMATS, NAMES, pictures
 
 from gsstream.core.errors import SourceError
-from gsstream.input.recordings.open import open_source, read_layout
+from gsstream.input.recordings.open import DEMO_FOLDER, open_source, read_layout
 from gsstream.input.recordings.sync import RecordingWarning
 
 
@@ -197,3 +198,16 @@ def test_flat_pictures_of_later_instants_are_named(tmp_path: Path, world: World)
         RecordingWarning, match=r"pictures without a pose are left out: cam00_1\.png, .*\(4\); 4 cameras"
     ):
         assert open_source(str(folder)).info.num_frames == 1
+
+
+def test_folders_and_videos_that_cameras_json_does_not_name_are_said_but_not_depth_maps(tmp_path: Path) -> None:
+    folder = tmp_path / "demo"
+    shutil.copytree(DEMO_FOLDER, folder)
+    camera = next(path for path in sorted(folder.iterdir()) if path.is_dir())
+    shutil.copytree(camera, folder / "depth_frame0")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        whole = open_source(str(folder)).info
+    shutil.copytree(camera, folder / "preview")
+    with pytest.warns(RecordingWarning, match=r"cameras\.json: pictures without a pose are left out: preview \(1\); 9"):
+        assert open_source(str(folder)).info.train.ids == whole.train.ids

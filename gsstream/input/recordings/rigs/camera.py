@@ -15,6 +15,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.clips import VIDEO_SUFFIXES, Clip, files_in, folders_in, images_in
+from gsstream.input.recordings.depth_maps import FOLDER
 from gsstream.input.recordings.foreign import left_out, warn
 from gsstream.input.recordings.lens import Lens
 from gsstream.input.recordings.recorded import Recording
@@ -97,17 +98,16 @@ def say_unused(where: Path, clips: Mapping[str, Clip], named: Collection[Path] =
     ``named``: those of which something was said already. ``flat``: look into folders that cameras share, too.
     """
     used = {path for clip in clips.values() for path in clip.files} | set(named)
+    known = used | {path.parent for path in used}
     homes = Counter(place for clip in clips.values() for place in {path.parent for path in clip.files})
     films = {path.parent for path in used if path.suffix.lower() in VIDEO_SUFFIXES}
-    found: list[Path] = []
-    for place, shared in homes.items():
-        if place in films:
-            found += files_in(place, VIDEO_SUFFIXES)
-        elif shared == 1 and len(clips) > 1:
-            found += [folder for folder in folders_in(place.parent) if images_in(folder)]
-        elif flat:
-            found += images_in(place)
-    known = used | {path.parent for path in used}
+    alone = {place for place, shared in homes.items() if shared == 1 and len(clips) > 1 and place not in films}
+    found = [path for place in sorted(films & set(homes)) for path in files_in(place, VIDEO_SUFFIXES)]
+    for parent in sorted({place.parent for place in alone}):
+        beside = (folder for folder in folders_in(parent) if folder not in known and folder.name != FOLDER)
+        found += [folder for folder in beside if images_in(folder)]
+    for place in sorted(set(homes) - films - alone if flat else ()):
+        found += images_in(place)
     if other := list(dict.fromkeys(path.name for path in found if path not in known)):
         some = ", ".join(other[:8]) + (", ..." if len(other) > 8 else "")
         warn(f"{where}: pictures without a pose are left out: {some} ({len(other)}); {len(clips)} cameras stay")

@@ -161,6 +161,20 @@ def test_twelve_cameras_with_noise_are_found() -> None:
     assert np.median(off) > 0.1 * np.median(deviation)
 
 
+def test_the_deviation_knows_that_the_corners_of_a_picture_are_off_together() -> None:
+    """A board that moved between two cameras' exposures: half a pixel, in one direction for all of a picture."""
+    ratios = []
+    for seed in range(3):
+        truth, seen = walk(4, 80, noise=0.1, close=12, seed=seed)
+        draw = np.random.default_rng(seed)
+        moved = {key: Sighting(one.ids, one.places + 0.5 * draw.normal(size=2)) for key, one in seen.items()}
+        start, _ = first_guess(BOARD, moved, truth.lenses, list("abcd"), len(truth.boards))
+        corners = corners_of(moved)
+        found = adjust(start, corners)
+        ratios += list((found.lenses[:, 0] / truth.lenses[:, 0] - 1) / focal_deviation(found, corners))
+    assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 1.6
+
+
 def test_a_few_false_corners_move_nothing() -> None:
     truth, seen = walk(4, 60, noise=0.1, close=15)
     draw = np.random.default_rng(5)

@@ -132,24 +132,14 @@ def accounted(out: Path, names: Sequence[str], fps: float) -> dict[str, Any]:
     """Return what became of every instant from the first to the last; one without a word is a GsstreamError."""
     told = records(out / "capture" / "capture.jsonl")
     lines = read_lines(out / "run" / METRICS)
-    times = [line["time"] for line in told]
-    # Instants follow one another by the clock of the cameras, within 5 % of the rig's rate.
-    gaps = [round((b - a) * fps) - 1 for a, b in itertools.pairwise(times)]
     decoded, kinds = decoded_frames(out / "run" / STREAM)
     frames = [line["frame"] for line in lines]
     if not frames == decoded == list(range(len(told))):
         raise GsstreamError(f"{len(told)} instants captured, {len(frames)} lines, {len(decoded)} frames decoded")
     policies = Counter(line["live"]["policy"] or "encoded in turn" for line in lines)
-    absent = Counter(name for line in told for name in line["absent"])
     pictures = reported(out / "capture", names)
     return {
-        "instants_by_the_clock": len(told) + sum(gaps),
-        "captured": len(told),
-        "of_all_cameras": sum(not line["absent"] for line in told),
-        "dropped_by_the_capture": told[-1]["dropped"],
-        "without_any_camera": sum(gaps) - told[-1]["dropped"],
-        "pictures_absent": sum(absent.values()),
-        "absent": dict(absent),
+        **instants_of(told, fps),
         "files_that_lines_name": _named_files(out / "capture", told, names),
         "mixed_instants": pictures["mixed"],
         "lines": len(lines),
@@ -158,6 +148,29 @@ def accounted(out: Path, names: Sequence[str], fps: float) -> dict[str, Any]:
         "policies": dict(policies),
         "faults": dict(Counter(fault["what"] for fault in records(out / "faults.jsonl"))),
         **grown(records(out / "samples.jsonl")),
+    }
+
+
+def instants_of(told: Sequence[dict[str, Any]], fps: float) -> dict[str, Any]:
+    """Return what became of the instants from the first to the last line of a capture, by the clock of the cameras.
+
+    They follow one another within 5 % of the rig's rate; where lines are further apart, instants lie between that were
+    dropped, of which the lines count, or of which no camera had a picture.
+    """
+    times = [line["time"] for line in told]
+    between = sum(round((b - a) * fps) - 1 for a, b in itertools.pairwise(times))
+    dropped, absent = (
+        told[-1]["dropped"] - told[0]["dropped"],
+        Counter(name for line in told for name in line["absent"]),
+    )
+    return {
+        "instants_by_the_clock": len(told) + between,
+        "captured": len(told),
+        "of_all_cameras": sum(not line["absent"] for line in told),
+        "dropped_by_the_capture": dropped,
+        "without_any_camera": between - dropped,
+        "pictures_absent": sum(absent.values()),
+        "absent": dict(absent),
     }
 
 

@@ -61,7 +61,7 @@ def shown(rig: Path, out: Path, size: tuple[int, int], test: str) -> dict[str, A
     ):
         try:
             _wait_for(out / "run" / METRICS, process)
-            watched(page, f"http://127.0.0.1:{port}")
+            watched(page, f"http://127.0.0.1:{port}", seconds=PATIENCE)
             first = page.evaluate(f"{PLAYER}.frame")
             page.until(f"{PLAYER}.frame >= {first + FRAMES}", PATIENCE)
             page.evaluate(f"{PLAYER}.pause()")

@@ -44,11 +44,11 @@ def shown(rig: Path, out: Path, size: tuple[int, int], test: str) -> dict[str, A
         test: the camera from whose place the page shows the scene first.
 
     Returns the frame that the page showed, how far its picture is from the camera's of that instant, and how late
-    frames were: from the cameras to their files, to packets, to the browser's pixels. Raises GsstreamError when the run
+    frames were: from their files to packets, and until the page had drawn them. Raises GsstreamError when the run
     ends before that.
     """
     sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "packet"), str(ROOT / "tests" / "web")]
-    from live_latency import PLAYER, times, watched
+    from browser_runs import MESSAGE, PLAYER
     from live_runs import browsing
 
     port = _free_port()
@@ -61,20 +61,19 @@ def shown(rig: Path, out: Path, size: tuple[int, int], test: str) -> dict[str, A
     ):
         try:
             _wait_for(out / "run" / METRICS, process)
-            watched(page, f"http://127.0.0.1:{port}", seconds=PATIENCE)
-            first = page.evaluate(f"{PLAYER}.frame")
-            page.until(f"{PLAYER}.frame >= {first + FRAMES}", PATIENCE)
+            page.go(f"http://127.0.0.1:{port}")
+            page.until(f"{PLAYER}?.latency?.frames.length >= {FRAMES}", PATIENCE)
             page.evaluate(f"{PLAYER}.pause()")
             time.sleep(1.0)
             frame = page.evaluate(f"{PLAYER}.frame")
             page.screenshot(str(out / "browser.png"))
-            late = times(page)
+            late, said = page.evaluate(f"[{PLAYER}.latency.frames, {MESSAGE}]")
         finally:
             process.terminate()
             process.wait()
     seen = out / "capture" / test / f"{frame:06d}.jpg"
     return {
-        "page_messages": page.messages,
+        "page_said": [said, *page.messages],
         "frame": frame,
         "page_against_camera_db": round(_psnr(out / "browser.png", seen), 2),
         **_latencies(out, late),
@@ -87,7 +86,7 @@ def _latencies(out: Path, late: Sequence[dict[str, float]]) -> dict[str, Any]:
     return {
         "frames_measured": len(late),
         "file_to_packet_ms": round(1000 * median(line["live"]["latency_seconds"] for line in lines)),
-        "packet_to_pixels_ms": round(median(entry["finished"] for entry in late)),
+        "packet_to_drawn_ms": round(median(entry["drawn"] for entry in late)),
     }
 
 

@@ -79,10 +79,10 @@ def report(what: str, measured: list[dict[str, float]]) -> None:
         print(f"  written to {name}: median {middle:.0f} ms, 95 % {most:.0f}, worst {worst:.0f}")
 
 
-def watched(page: Any, url: str, clock: float = 4.0, seconds: float = 60) -> None:
+def watched(page: Any, url: str, clock: float = 4.0) -> None:
     """Open the page and let it learn the server's clock before anything comes."""
     page.go(url)
-    page.until(f"{PLAYER.replace(').player', ')?.player')}?.buffer?.socket?.socket?.readyState === 1", seconds)
+    page.until(f"{PLAYER.replace(').player', ')?.player')}?.buffer?.socket?.socket?.readyState === 1", 60)
     time.sleep(clock)
     page.evaluate(FINISH)
 

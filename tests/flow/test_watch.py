@@ -204,3 +204,21 @@ def test_interrupting_while_waiting_ends_at_once_and_resume_goes_on(
     capture.main(finished, live, 100, {})
     assert run_command([*command, "--resume"]) == 0
     assert packets(out / "stream.gss") == truth
+
+
+def test_a_run_is_resumed_whose_second_frame_lacks_the_test_camera(finished: Path, tmp_path: Path) -> None:
+    """The noise of a camera is measured between the first two frames: without the second there is none to restore."""
+    live, out = tmp_path / "live", tmp_path / "run"
+    shutil.copytree(finished, live)
+    cameras = json.loads((live / "cameras.json").read_text())["cameras"]
+    (tested,) = (camera for camera in cameras if camera["split"] == "test")
+    (live / (tested["frames"] % 1)).unlink()
+    command = arguments(out, source=f"watch:{live}?missing=hold", **QUICK)
+    assert run_command([*command, "--frames", "3"]) == 0
+    assert run_command([*command, "--frames", "4", "--resume"]) == 0
+    assert [sorted(line.get("psnr", {})) for line in metrics(out)] == [
+        [tested["id"]],
+        [],
+        [tested["id"]],
+        [tested["id"]],
+    ]

@@ -80,5 +80,7 @@ class HeldOut:
 
 
 def _noise(first: Frame, second: Frame) -> list[float]:
-    """Noise of every camera, image units."""
+    """Noise of every camera, image units; empty where the second frame lacks them, because a camera was absent."""
+    if second.cameras.ids != first.cameras.ids:
+        return []
     return [noise_sigma(first.image(view), second.image(view)) for view in range(len(first.cameras))]

@@ -32,12 +32,18 @@ def memory_limit() -> int:
     The innermost :func:`limited_memory`, else ``GSSTREAM_MAX_MEMORY``, else half of the machine's memory. Raises
     InputError when the variable holds no positive size.
     """
+    named = named_limit()
+    return int(SHARE * _machine()) if named is None else named
+
+
+def named_limit() -> int | None:
+    """Return the limit that somebody named, as :func:`memory_limit` does; None where nobody did."""
     given = _given.get()
     if given is not None:
         return given
     text = os.environ.get(VARIABLE)
     if text is None:
-        return int(SHARE * _machine())
+        return None
     try:
         size = int(read_quantity(text, BYTES))
     except ValueError as error:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import zstandard
 
-from gsstream.core.memory import limited_memory, require_memory
+from gsstream.core.memory import limited_memory, memory_limit, named_limit, require_memory
 from gsstream.packet import PacketKind, PlayerState
 from gsstream.packet.base import MAX_META, Section, add_offset, parse_packet
 from gsstream.packet.bits import BitReader, unpack_blobs
@@ -20,6 +20,9 @@ from gsstream.player.render import PER_PIXEL
 #: Bytes at the peak for every number of a Gaussian in a key packet or an added Gaussian (4 of them stay), for every
 #: Gaussian that a delta reaches, and for every byte of meta as JSON (lists of empty objects are worst).
 PER_NUMBER, PER_DELTA_ROW, PER_META_BYTE = 30, 200, 30
+#: What a stream may take where nobody names a limit: so many bytes, and so many for each byte of the file up to the end
+#: of the packet. Streams of recordings take at most 200 for each of theirs.
+FREE, PER_STREAM_BYTE = 200_000_000, 1000
 _COUNTS = struct.Struct("<II")
 
 
@@ -27,8 +30,8 @@ _COUNTS = struct.Struct("<II")
 class MemoryLimit:
     """A limit in bytes on the memory for a stream, beside the program itself (about 80 MB).
 
-
-    None: what :func:`gsstream.core.memory.memory_limit` says.
+    None: what :func:`gsstream.core.memory.memory_limit` says. Where nobody named that either, a packet is refused that
+    announces far more than the bytes of its stream can honestly hold, so that a small file takes little memory.
     """
 
     most: int | None = None
@@ -50,11 +53,19 @@ class MemoryLimit:
         elif header.kind == PacketKind.DELTA and state is not None:
             rows, numbers = len(state.gaussians), 14 + 3 * state.gaussians.shN.shape[1]
             wanted += rows * (PER_DELTA_ROW + 8 * numbers) + _num_added(sections) * PER_NUMBER * numbers
-        self._check(wanted, f"decoding frame {header.frame}")
+        with limited_memory(self._trusted(offset + len(data))):
+            require_memory(wanted, f"decoding frame {header.frame}")
 
     def check_pictures(self, width: int, height: int, kept: int = 1) -> None:
         """Refuse pictures of a size of which ``kept`` are in memory at a time, as bytes. Raises InputError."""
         self._check(width * height * (PER_PIXEL + 3 * kept), f"drawing {width} x {height} pixels")
+
+    def _trusted(self, size: int) -> int:
+        """Bytes that decoding may take when so many bytes of the stream have been read."""
+        if self.most is not None:
+            return self.most
+        limit = memory_limit()
+        return limit if named_limit() is not None else min(limit, FREE + PER_STREAM_BYTE * size)
 
     def _check(self, wanted: int, what: str) -> None:
         with limited_memory(self.most):

@@ -5,7 +5,7 @@ import { decodeAttributes } from "./attributes.js";
 import { viewOf } from "./container.js";
 import { unpackParts } from "./bits.js";
 import { PacketError, located } from "./errors.js";
-import { ATTRIBUTES, FREE_GAUSSIANS, MAX_GAUSSIANS, MAX_GAUSSIANS_PER_BYTE } from "./limits.js";
+import { ATTRIBUTES, checkMemory, FREE_GAUSSIANS, MAX_GAUSSIANS, MAX_GAUSSIANS_PER_BYTE } from "./limits.js";
 import { MAX_META, MAX_UNIT, MAX_UNITS } from "./limits.js";
 import { parseMeta } from "./meta.js";
 import { decodeSymbols, within } from "./symbols.js";
@@ -27,9 +27,11 @@ export function decodeKey(found, size, offset) {
   }
   const meta = located(found.meta.offset, () => decodeMeta(found.meta.data));
   const layout = located(found.layout.offset, () => decodeLayout(found.layout.data, mostGaussians(size)));
+  const rest = found.shN.data[1];
+  located(offset, () => checkMemory(layout.unitOf.length, 14 + Math.min(45, rest ?? 0), offset + size));
   const decode = layered ? later.layers : decodeAttributes;
   const scene = decode(found, layout.unitOf.length);
-  return { scene, layout, meta, rest: found.shN.data[1] };
+  return { scene, layout, meta, rest };
 }
 
 /** How many Gaussians and nodes a key packet of so many bytes may announce. */

@@ -6,7 +6,7 @@ import { KIND, PACKET_HEADER, SECTION_HEADER, crc32, parseHeader, splitSections,
 import { firstState } from "./decode.js";
 import { PacketError, located } from "./errors.js";
 import { decodeMeta, later, mostGaussians } from "./key.js";
-import { ATTRIBUTES } from "./limits.js";
+import { ATTRIBUTES, checkMemory } from "./limits.js";
 import { decodeSymbols } from "./symbols.js";
 
 const HEAD = 12;
@@ -87,6 +87,7 @@ function soundLayer(data) {
   if (!layered || body.length < size || count > mostGaussians(size) || crc32(body) !== checksum) return null;
   const found = splitSections(7, body, START);
   if (`${Object.keys(found)}` !== `meta,${ATTRIBUTES}`) return null;
+  checkMemory(count, 14 + Math.min(45, found.shN.data[1] ?? 0), START + size);
   const scene = decodeAttributes(found, count);
   return firstState(frame, count, { scene, layout: null, meta: decodeMeta(found.meta.data), rest: found.shN.data[1] });
 }

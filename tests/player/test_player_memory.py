@@ -16,8 +16,8 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.changes import Delta
 from gsstream.core.errors import InputError
 from gsstream.core.gaussians import Gaussians
-from gsstream.core.memory import limited_memory
-from gsstream.packet import KeyState, StreamWriter, decode_packet, encode_delta, encode_key
+from gsstream.core.memory import VARIABLE, limited_memory
+from gsstream.packet import KeyState, StreamReader, StreamWriter, decode_packet, encode_delta, encode_key
 from gsstream.player.memory import MemoryLimit
 from gsstream.player.play import play
 from gsstream.player.playback import Playback
@@ -25,6 +25,8 @@ from gsstream.player.render import PlayerRenderer, named_renderer, render
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "packet"))
 from packet_scenes import make_delta, make_edit, make_key, make_motions
+
+from tools.hostile_streams import STREAMS
 
 MB = 1_000_000
 
@@ -51,6 +53,34 @@ def test_a_small_file_that_announces_much_is_refused_cheaply(tmp_path) -> None:
         tracemalloc.stop()
     with Playback(path, max_memory=200 * MB) as playback:
         assert len(playback.state_at(0)) == 65_000
+
+
+@pytest.mark.parametrize(
+    ("name", "trusted"), [("1,100,000 Gaussians of degree 3", False), ("a scene of one Gaussian", True)]
+)
+def test_a_small_stream_is_trusted_with_little_where_nobody_names_a_limit(
+    name: str, trusted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(VARIABLE, raising=False)
+    data = STREAMS[name]()
+    assert len(data) <= 16_384
+    path = tmp_path / "s.gss"
+    path.write_bytes(data)
+    with StreamReader(path) as reader:
+        (entry,) = reader.frames
+        key = reader.read(entry)
+    limit = MemoryLimit()
+    if trusted:
+        limit.check_decoding(key, None, entry.offset)
+    else:
+        with pytest.raises(InputError, match=r"takes about 1,9\d\d MB; the limit is 216 MB. Raise --max-memory"):
+            limit.check_decoding(key, None, entry.offset)
+        limit.check_decoding(key, None, 2_000_000)  # the same behind the bytes of a large scene
+    # Whoever names a limit is taken at his word, in either direction.
+    monkeypatch.setenv(VARIABLE, "9GB")
+    limit.check_decoding(key, None, entry.offset)
+    with limited_memory(1), pytest.raises(InputError, match="the limit is"):
+        limit.check_decoding(key, None, entry.offset)
 
 
 @pytest.mark.parametrize("sh_rest", [0, 3, 15])

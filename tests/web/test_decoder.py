@@ -19,6 +19,7 @@ from gsstream.packet import decode_packet
 from gsstream.packet.base import file_header
 from gsstream.packet.bits import compress, decompress
 from gsstream.packet.symbols import encode_symbols
+from tools.hostile_streams import STREAMS
 
 pytestmark = needs_node
 HERE = Path(__file__).parent
@@ -220,3 +221,12 @@ def test_streams_that_are_none_are_refused_in_one_sentence(tmp_path):
         assert stream["digests"] == []
         assert stream["error"]["expected"]
         assert stream["error"]["offset"] is not None
+
+
+def test_a_small_stream_is_trusted_with_little_memory(tmp_path: Path) -> None:
+    """A key packet of 16 KB may announce 1.1 million Gaussians; of degree 3 they would take 780 MB."""
+    many, few = (STREAMS[name]() for name in ("1,100,000 Gaussians of degree 3", "65,536 Gaussians of degree 3"))
+    found = play_in_node([many, few], tmp_path)
+    assert "more than a stream of 16347 bytes is trusted with" in found["streams"][0]["error"]["message"]
+    assert (found["streams"][1]["error"], len(found["streams"][1]["digests"])) == (None, 1)
+    assert found["megabytes"] < 300

@@ -4,7 +4,7 @@ import { decodeAttributes } from "../attributes.js";
 import { BitReader, unpackParts } from "../bits.js";
 import { PacketError, ofSection } from "../errors.js";
 import { decodeUnits } from "../key.js";
-import { ATTRIBUTES, MAX_GAUSSIANS, MAX_GAUSSIANS_PER_BYTE } from "../limits.js";
+import { ATTRIBUTES, checkMemory, MAX_GAUSSIANS, MAX_GAUSSIANS_PER_BYTE } from "../limits.js";
 import { decodeGates, decodeSymbols } from "../symbols.js";
 
 /** Sections that this change is made of. */
@@ -45,6 +45,7 @@ function decodeAdded({ data, offset }, layout, most) {
   if (number > Math.min(allowed, most) || newNodes > Math.min(allowed, MAX_GAUSSIANS - nodes)) {
     throw new PacketError(`added: ${number} Gaussians and ${newNodes} nodes are beyond the limits`);
   }
+  checkMemory(layout.unitOf.length + number, 14 + Math.min(45, parts.at(-1)[1] ?? 0), offset + data.length);
   const up = decodeSymbols(parts[1], newNodes, 1);
   for (let i = 0; i < newNodes; i += 1) {
     if (up[i] < 0 || up[i] > nodes + i) throw new PacketError("added: a parent that is no node before its own");

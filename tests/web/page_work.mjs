@@ -1,7 +1,8 @@
 // What a page's own thread does while a stream plays and seeks, from Chromium's trace.
 //
 // Usage: node page_work.mjs CHROMIUM URL [SECONDS] -> JSON on standard output: milliseconds from the beginning of the
-// page to its first picture; and, while it plays for SECONDS and then seeks eight times: pictures drawn, frames shown,
+// page to its first picture and to the first whole one (a first layer is drawn before); whether the stream is decoded in
+// a worker; and, while it plays for SECONDS and then seeks eight times: pictures drawn, frames shown,
 // the longest task of the page's thread by the clock (`wall`) and by its processor time (`cpu`), tasks longer than 16 ms
 // of processor time, and processor time a picture.
 
@@ -11,7 +12,9 @@ const [, , chromium, url, seconds = "4"] = process.argv;
 const CATEGORIES = ["toplevel", "disabled-by-default-devtools.timeline", "__metadata"];
 const FIRST = `setInterval(() => {
   const player = document.querySelector("gsstream-player")?.player;
-  if (player?.statistics?.drawn) window.first ??= performance.now();
+  const { drawn, early } = player?.statistics ?? {};
+  if (drawn || early) window.first ??= performance.now();
+  if (drawn) window.whole ??= performance.now();
 }, 4)`;
 
 const browser = await Browser.start(chromium, { width: 320, height: 180 });
@@ -27,8 +30,9 @@ browser._received = (message) => {
 
 await browser.send("Page.addScriptToEvaluateOnNewDocument", { source: FIRST });
 await browser.go(url);
-await browser.until("window.first", 120);
-const first = await browser.evaluate("window.first");
+await browser.until("window.whole", 120);
+const [first, whole] = await browser.evaluate("[window.first, window.whole]");
+const decoded = await browser.evaluate(`${PLAYER}.link?.worker ? "in a worker" : "on the page's thread"`);
 await pause(500);
 await browser.send("Tracing.start", { transferMode: "ReportEvents", traceConfig: { includedCategories: CATEGORIES } });
 await browser.evaluate(`window.frames_ = 0; ${PLAYER}.addEventListener("frame", () => { frames_ += 1; });
@@ -63,6 +67,8 @@ const rounded = (value) => Math.round(100 * value) / 100;
 console.log(
   JSON.stringify({
     first: Math.round(first),
+    whole: Math.round(whole),
+    decoded,
     pictures,
     frames,
     longest: { wall: rounded(most("dur")), cpu: rounded(most("tdur")) },

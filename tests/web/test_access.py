@@ -104,6 +104,26 @@ def test_space_presses_the_button_that_has_the_focus_and_escape_closes(site, tmp
     ]
 
 
+@pytest.mark.parametrize("name", ["play", "loop", "marks", "statistics", "full", "more"])
+def test_space_presses_every_button_and_nothing_else(site, tmp_path, name):
+    """Each button says by one of these what it did; only one of them plays."""
+    button = f"{ROOT}.querySelector('.{name}')"
+    state = f"[{button}.ariaPressed, {button}.ariaExpanded, {button}.ariaLabel, Boolean(document.fullscreenElement)]"
+    both = ["evaluate", f"[{state}, {PLAYER}.playing]"]
+    steps = [
+        ["go", "URL/index.html"],
+        ["until", f"{PLAYER}?.drew"],
+        ["evaluate", f"{ROOT}.querySelector('.more').click(), {button}.focus()"],
+        both,
+        *press(" "),
+        ["pause", 300],
+        both,
+    ]
+    (before, still), (after, playing) = [found for found in look(site, tmp_path, steps) if isinstance(found, list)]
+    assert before != after
+    assert (still, playing) == (False, name == "play")
+
+
 def test_arrows_turn_plus_and_minus_zoom_comma_and_period_step(site, tmp_path):
     view = ["evaluate", f"[{PLAYER}.view.eye, Math.hypot(...{PLAYER}.view.eye), {PLAYER}.frame]"]
     still = ["until", "!document.querySelector('gsstream-player').controls.outside"]
@@ -149,9 +169,9 @@ def test_who_wants_no_motion_begins_it(site, tmp_path):
 
 def test_attributes_may_change_and_what_is_not_there_is_said(site, tmp_path):
     element = "document.querySelector('gsstream-player')"
-    change = "".join(
-        f"{element}.setAttribute('{n}', '{v}');" for n, v in {"camera": "left", "speed": "2", "loop": "false"}.items()
-    )
+    values = {"camera": "left", "speed": "2", "loop": "false", "controls": "false", "marks": ""}
+    change = "".join(f"{element}.setAttribute('{n}', '{v}');" for n, v in values.items())
+    bar = f"{ROOT}.querySelector('.bar').hidden"
     second = """document.body.append(document.createElement('gsstream-player'));
       document.querySelectorAll('gsstream-player')[1].shadowRoot.querySelector('.message').textContent"""
     steps = [
@@ -159,20 +179,20 @@ def test_attributes_may_change_and_what_is_not_there_is_said(site, tmp_path):
         READY,
         ["until", f"{PLAYER}.drew"],
         ["evaluate", MESSAGE],
-        ["evaluate", f"{change}[{PLAYER}.view.id, {PLAYER}.speed, {PLAYER}.loop]"],
+        ["evaluate", f"{change}[{PLAYER}.view.id, {PLAYER}.speed, {PLAYER}.loop, {bar}, {PLAYER}.marks]"],
         ["evaluate", second],
     ]
     results = look(site, tmp_path, steps)
     assert '"nosuch"' in results[3]
     assert "held-out" in results[3]
-    assert results[4] == ["left", 2, False]
+    assert results[4] == ["left", 2, False, True, True]
     assert "src" in results[5]
 
 
 CASES = {
     "absent.gss": ("404", "address"),
-    "page.gss": ("not a gsstream file", ".gss"),
-    "page.json": ("no manifest", ".gss"),
+    "page.gss": ("/page.gss is not a gsstream file", "Name a stream.json"),
+    "page.json": ("/page.json is no manifest", "Name a stream.json"),
     "damaged.gss": ("at byte", "again"),
     "OTHER/stream.gss": ("CORS", "Access-Control-Allow-Origin"),
     "OTHER/stream.json": ("CORS", "Access-Control-Allow-Origin"),

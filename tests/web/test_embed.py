@@ -178,6 +178,20 @@ def test_the_poster_is_shown_until_the_first_picture(site, tmp_path, page, poste
     assert results[-1] == [False, True, ""]
 
 
+def test_the_poster_does_not_wait_for_modules(site, tmp_path):
+    """Regression: it came with the first picture, because its address was known to the player alone."""
+    with serving(site) as (url, server):
+        steps = [
+            ["send", "Network.setBlockedURLs", {"urls": ["*element.js"]}],
+            ["go", f"{url}/index.html"],
+            ["until", f"performance.getEntriesByName('{url}/poster.jpg').length"],
+        ]
+        try_in_browser(steps, tmp_path)
+        asked = [path for path, _ in server.requests]
+    assert "/element.js" not in asked
+    assert asked.count("/poster.jpg") == 1
+
+
 def test_a_page_opened_as_a_file_says_how_to_serve_it(site, tmp_path):
     steps = [
         ["go", (site / "index.html").as_uri()],

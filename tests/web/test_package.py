@@ -68,6 +68,14 @@ def test_the_worker_asks_for_all_its_modules_at_once():
     assert "changes/residual.js" in found
 
 
+@pytest.mark.parametrize(
+    "page", [WEB / "index.html", *sorted(EXAMPLES.rglob("*.html"))], ids=lambda path: path.parent.name
+)
+def test_a_page_names_an_icon(page):
+    """Without one a browser asks the server for /favicon.ico and reports that it is not there."""
+    assert '<link rel="icon"' in page.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("example", sorted(EXAMPLES.rglob("*.js")), ids=lambda path: path.name)
 def test_examples_import_what_a_package_exports(example):
     text = example.read_text(encoding="utf-8")

@@ -84,6 +84,7 @@ def test_pictures_and_uploads(tmp_path):
             ["evaluate", opacity],
             ["release", 348, 36],
             ["until", f"{opacity} === 1"],
+            ["evaluate", "parseInt(renderer.getClearColor({ copy: (colour) => colour.getHexString() }), 16)"],
             *ask,
             ["evaluate", small],
         ]
@@ -91,9 +92,13 @@ def test_pictures_and_uploads(tmp_path):
         before, _, after, (amount, used, height) = results[2:6]
         assert math.dist(before, after) > 0.01, "a drag turns"
         assert 0.4 <= results[8] < 1, "a view outside of the recorded region fades, and springs back"
+        behind = [results[11] >> shift & 255 for shift in (16, 8, 0)]
+        assert behind == pytest.approx([255 * value for value in make_meta().background], abs=1), (
+            "the stream's background"
+        )
         assert height == 3 * rig.height
         assert (amount, used) == (pytest.approx(9 * 0.3), pytest.approx(9 * 0.3))
-        for frame, text in zip(frames, results[11:-1], strict=True):
+        for frame, text in zip(frames, results[12:-1], strict=True):
             picture = decoded(text, rig.width, rig.height)[::-1]
             found = psnr(drawn(playback, frame), picture)
             print(frame, found)

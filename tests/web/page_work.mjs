@@ -2,9 +2,11 @@
 //
 // Usage: node page_work.mjs CHROMIUM URL [SECONDS] -> JSON on standard output: milliseconds from the beginning of the
 // page to its first picture and to the first whole one (a first layer is drawn before); whether the stream is decoded in
-// a worker; and, while it plays for SECONDS and then seeks eight times: pictures drawn, frames shown,
+// a worker; seconds of processor time of the whole browser until then; and, while it plays for SECONDS and then seeks eight times: pictures drawn, frames shown,
 // the longest task of the page's thread by the clock (`wall`) and by its processor time (`cpu`), tasks longer than 16 ms
 // of processor time, and processor time a picture.
+
+import { readFileSync, readdirSync } from "node:fs";
 
 import { Browser, PLAYER } from "./browser.mjs";
 
@@ -28,9 +30,26 @@ browser._received = (message) => {
   else received(message);
 };
 
+/** Seconds of processor time that all processes of the browser have taken. */
+function used() {
+  const lines = readdirSync("/proc").filter(Number).flatMap((name) => {
+    try {
+      return [readFileSync(`/proc/${name}/stat`, "utf8").replace(/^.*\) /, "").split(" ")];
+    } catch {
+      return []; // It has ended meanwhile.
+    }
+  });
+  // Process group, and hundredths of a second in its own code and in the system's.
+  const own = lines.filter((fields) => Number(fields[2]) === browser.child.pid);
+  return own.reduce((sum, fields) => sum + (Number(fields[11]) + Number(fields[12])) / 100, 0);
+}
+
 await browser.send("Page.addScriptToEvaluateOnNewDocument", { source: FIRST });
+await pause(500);
+const before = used();
 await browser.go(url);
 await browser.until("window.whole", 120);
+const processor = used() - before;
 const [first, whole] = await browser.evaluate("[window.first, window.whole]");
 const decoded = await browser.evaluate(`${PLAYER}.link?.worker ? "in a worker" : "on the page's thread"`);
 await pause(500);
@@ -68,6 +87,7 @@ console.log(
   JSON.stringify({
     first: Math.round(first),
     whole: Math.round(whole),
+    processor: rounded(processor),
     decoded,
     pictures,
     frames,

@@ -2,7 +2,7 @@
 #   make demo            encode the recording that ships with gsstream; says where the pictures are and how to open it
 #   make test            lint, types, import rules and all tests
 #   make check           the same with the quick tests alone: for every change, in a minute or two on two cores
-#   make docs            the reference pages that are made from the code, in docs/reference/
+#   make docs            the reference pages that are made from the code, in docs/reference/; after make demo the gallery, too
 #   make gallery         the demo's stream on a page, with what it costs beside it, in runs/gallery/: static files to host
 #   make film            the film at the head of the README, from a run of the demo (minutes); its page needs node and Chromium
 #   make dist            every distribution, as source archive and wheel, in dist/
@@ -61,6 +61,7 @@ test-live: setup
 
 docs: setup
 	$(BIN)/python -m tools.reference
+	@if test -f $(DEMO_OUT)/stream.gss; then $(MAKE) --no-print-directory gallery; fi
 
 gallery: $(DEMO_OUT)/stream.gss
 	$(BIN)/python -m tools.gallery $(DEMO_OUT) --out runs/gallery

@@ -17,8 +17,8 @@ export const settings = { patience: 15_000, firstPause: 300, fetch: (...args) =>
 export async function request(url, { start = 0, end = null, ranged = true, signal } = {}) {
   const headers = ranged ? { Range: start < 0 ? `bytes=${start}` : `bytes=${start}-${end ?? ""}` } : {};
   const stall = new AbortController();
-  const either = AbortSignal.any([stall.signal, signal ?? stall.signal]);
-  return patient(settings.fetch(url, { headers, signal: either }), "The server does not answer.", stall);
+  signal?.addEventListener("abort", () => stall.abort(signal.reason), { once: true });
+  return patient(settings.fetch(url, { headers, signal: stall.signal }), "The server does not answer.", stall);
 }
 
 /** What a promise comes to, or a SourceError with `words` when that takes too long; `stall` then ends it. */

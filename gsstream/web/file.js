@@ -14,7 +14,7 @@ export async function openFile(url, signal) {
     throw error instanceof SourceError || signal?.aborted ? error : new SourceError(`There is no server at ${url}.`);
   });
   // A server that knows no ranges begins with all of it: it is asked again without one.
-  if (response.status === 200) response.body.cancel();
+  if (response.status === 200) response.body.cancel().catch(() => {});
   if ([200, 416].includes(response.status)) return plain;
   if (response.status !== 206) throw refusal(response, url);
   const total = /\/(\d+)$/.exec(response.headers.get("Content-Range") ?? "");

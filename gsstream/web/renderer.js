@@ -28,15 +28,12 @@ export class Renderer {
     this.background = [0, 0, 0];
     this.marks = false;
     this.uploaded = 0;
-    this.textures = new SceneTextures(gl);
     this.sorter = new SortQueue(onChange, useWorker);
-    /** The slot of each row, null while they are the same; the frame that is there. */
-    this.list = this.frame = null;
+    /** The slot of each row, null while they are the same. */
+    this.list = null;
     this._setUp();
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
     canvas.addEventListener("webglcontextrestored", () => {
-      this.textures = new SceneTextures(gl);
-      this.frame = null;
       this._setUp();
       onLost();
     });
@@ -116,6 +113,9 @@ export class Renderer {
 
   _setUp() {
     const { gl } = this;
+    this.textures = new SceneTextures(gl);
+    /** The frame that is there. */
+    this.frame = null;
     // Hundreds of layers are blended into one pixel: eight bits would round each of them.
     const floats = gl.getExtension("EXT_color_buffer_float");
     const deep = floats || gl.getExtension("EXT_color_buffer_half_float");

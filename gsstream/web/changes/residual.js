@@ -38,7 +38,11 @@ export function decodeResidual(sections, state, offset) {
       throw new PacketError("delta packet: a decoder is sent that no attribute uses", sections.decoders.offset);
     }
   }
-  if (rows.length) checkWidths(parts, state.scene, state.layout.unitOf.length, offset);
+  for (const { name, width } of rows.length ? parts : []) {
+    if (width === state.widths[name]) continue;
+    const words = `delta of ${name}: expected ${state.widths[name]} values a row, got ${width}`;
+    throw new PacketError(`${words}; the packet belongs to another scene`, offset);
+  }
   return { rows, gate, levels, parts, decoders };
 }
 
@@ -206,16 +210,4 @@ function decodePart(name, data, rows, known) {
   const change = largest(symbols) * step * (decoder ? channels * largest(decoder.values) : 1);
   if (change > MAX_CHANGE) throw new PacketError(`${name}: a residual of ${change} cannot be`);
   return { name, symbols, channels, step, decoder, width: decoder ? decoder.width : channels };
-}
-
-function checkWidths(parts, scene, number, offset) {
-  for (const { name, width } of parts) {
-    if (width * number !== scene[name].length) {
-      throw new PacketError(
-        `delta of ${name}: expected ${scene[name].length / number} values a row, got ${width}; ` +
-          "the packet belongs to another scene",
-        offset,
-      );
-    }
-  }
 }

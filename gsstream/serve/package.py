@@ -29,8 +29,8 @@ from gsstream.serve.joins import encode_join
 
 MANIFEST, POSTER = "stream.json", "poster.jpg"
 SEGMENTS = "segments"
-#: Comments that fill whole lines of a module: a fifth of the bytes that a visitor would load.
-_COMMENTS = re.compile(rb"^[ \t]*(?://[^\n]*|/\*\*.*?\*/)\n", re.MULTILINE | re.DOTALL)
+#: What no browser needs of a module: empty lines, comments that fill whole lines, indentation. A fifth of its bytes.
+_SPARE = re.compile(rb"^[ \t]*(?://[^\n]*|/\*\*.*?\*/)?\n|^[ \t]+", re.MULTILINE | re.DOTALL)
 
 
 class Package(NamedTuple):
@@ -223,7 +223,7 @@ def _titled(page: str, name: str) -> str:
 
 
 def _copy(source: Traversable, target: Path) -> int:
-    """Copy the player's files, modules of its own without their comments; returns the bytes that were written."""
+    """Copy the player's files, modules of its own without comments and indentation; returns the bytes written."""
     size = 0
     for item in source.iterdir():
         if item.is_dir():
@@ -232,7 +232,7 @@ def _copy(source: Traversable, target: Path) -> int:
         elif not item.name.startswith((".", "__")):
             data = item.read_bytes()
             if item.name.endswith(".js") and source.name != "vendor":
-                data = _COMMENTS.sub(b"", data)
+                data = _SPARE.sub(b"", data)
             (target / item.name).write_bytes(data)
             size += len(data)
     return size

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -15,9 +16,9 @@ from gsstream.core.memory import limited_memory
 
 def export(
     stream: Stream,
-    out: Annotated[Path, typer.Option("--out", help="Folder for the files.")],
+    to: Annotated[str, typer.Option("--out", help="Folder for the files; of a live page also s3://BUCKET/DIR.")],
     kind: Annotated[
-        Literal["ply", "spz", "glb", "sequence", "usd", "4dgs", "manifest", "page"],
+        Literal["ply", "spz", "glb", "sequence", "usd", "4dgs", "manifest", "page", "live"],
         typer.Option("--format", help="PLYs, SPZs, GLBs, PLYs with a list; one file of OpenUSD or 4dgs; for the web."),
     ] = "ply",
     frames: Frames = None,
@@ -43,8 +44,12 @@ def export(
 
     A page is a folder with the browser player and the stream in segments; one that is there is replaced. A manifest
     (stream.json) holds no frame: it lists the byte ranges of all packets, so that any static web server can serve the
-    stream.
+    stream. A live page shows a run while it is written: parts that never change, and a manifest that rolls.
     """
+    if kind == "live":
+        _live(stream, to)
+        return
+    out = Path(to)
     first, last, most = *frame_range(frames), size_of(max_memory)
     file = stream_file(stream)
     if kind == "page":
@@ -70,6 +75,23 @@ def export(
     size = sum(path.stat().st_size for path in written)
     typer.echo(f"{out}: {plural(len(written), 'file')}, {size / 1e6:.1f} MB")
     fail_with(damage)
+
+
+def _live(stream: Path, to: str) -> None:
+    """Bring a stream to a place as it is written, until it ends or Ctrl-C."""
+    from gsstream.cli.open import coming
+    from gsstream.serve.follow import Follower
+    from gsstream.serve.parts import LivePackage
+    from gsstream.store.place import place_at
+
+    follower = Follower(coming(stream))
+    package = LivePackage(follower, place_at(to))
+    package.write_page()
+    typer.echo(f"{package.place.address}: the page is there, and the stream as it is written (Ctrl-C ends)")
+    try:
+        package.run(threading.Event(), lambda line: typer.echo(f"note: {line}", err=True))
+    finally:
+        follower.close()
 
 
 def _page(stream: Path, out: Path, renditions: list[Path], join_every: float) -> None:

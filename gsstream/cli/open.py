@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gsstream.cli.streams import stream_file
+from gsstream.core.errors import InputError
 
 if TYPE_CHECKING:
     from gsstream.serve.server import Server
@@ -22,7 +24,9 @@ LOOPBACK = "127.0.0.1"
 
 
 def open_stream(
-    stream: Annotated[Path, typer.Argument(help="A stream (.gss), or the output folder of a run.")],
+    stream: Annotated[
+        str, typer.Argument(help="A stream (.gss), the output folder of a run, or with --live ws://SERVER/live.")
+    ],
     live: Annotated[
         bool, typer.Option("--live", help="Show the newest frame as it is written; the stream may come later.")
     ] = False,
@@ -44,7 +48,15 @@ def open_stream(
 
     A recorded stream on this machine alone needs no extra; --live, --host, --token and --origin need gsstream[serve].
     """
-    file = _coming(stream) if live else stream_file(stream)
+    from gsstream.serve.relay import is_upstream
+
+    if is_upstream(stream):
+        if not live:
+            raise InputError(f"{stream.partition('?')[0]}: the socket of a live server is shown with --live")
+        with relaying(stream) as relayed:
+            _serve(relayed, live=True, host=host, port=port, token=token, viewers=viewers, origin=origin)
+        return
+    file = coming(Path(stream)) if live else stream_file(Path(stream))
     if not live and host == LOOPBACK and not token and not origin:
         from gsstream.serve.local import LocalServer
 
@@ -52,6 +64,19 @@ def open_stream(
             _show(file, local.url)
             local.serve_forever()
         return
+    _serve(file, live=live, host=host, port=port, token=token, viewers=viewers, origin=origin)
+
+
+def _serve(
+    file: Path,
+    *,
+    live: bool,
+    host: str,
+    port: int,
+    token: str | None,
+    viewers: int,
+    origin: list[str] | None,
+) -> None:
     from gsstream.serve.server import Server
 
     server = Server(
@@ -59,6 +84,17 @@ def open_stream(
     )
     _show(file, server.url, browser=host == LOOPBACK)
     server.run()
+
+
+@contextmanager
+def relaying(address: str) -> Iterator[Path]:
+    """Give the file in which the stream of another live server is while this is open, from its newest key packet on."""
+    from gsstream.serve.relay import Relay
+
+    with tempfile.TemporaryDirectory(prefix="relay-") as folder:
+        path = Path(folder) / "relayed.gss"
+        with Relay(address, path, lambda line: typer.echo(f"note: {line}", err=True)):
+            yield path
 
 
 def _show(file: Path, url: str, *, browser: bool = True) -> None:
@@ -93,6 +129,6 @@ def serving(server: Server | None) -> Iterator[None]:
         yield
 
 
-def _coming(stream: Path) -> Path:
-    """The file that a run will write, when ``stream`` is its folder; else ``stream``."""
+def coming(stream: Path) -> Path:
+    """Return the file that a run will write, when ``stream`` is its folder; else ``stream``."""
     return stream if stream.suffix == ".gss" and not stream.is_dir() else stream / "stream.gss"

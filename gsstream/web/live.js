@@ -13,14 +13,14 @@ export const settings = { quiet: 10_000 };
 
 /** Stands where a recording has its buffer (see buffer.js); the stream calls `feed` when the page can show more. */
 export class LiveBuffer {
-  constructor(url, stream) {
+  constructor(url, stream, Link = LiveSocket) {
     Object.assign(this, { url, stream, live: true, fps: 30, received: 0, first: null, last: null, lastLoaded: null });
     Object.assign(this, { queue: [], waiting: 0, gaps: [], told: "" });
     /** Bytes that may wait to be decoded. A page that is not shown takes no more and catches up later. */
     this.most = 16 * 2 ** 20;
     this.state = { name: "live", detail: "" };
     this.cut = this.broken = this.joined = this.before = null;
-    this.socket = new LiveSocket(this);
+    this.socket = new Link(this);
     this.clock = setInterval(() => this._tell(), 500);
     this.socket.start();
   }

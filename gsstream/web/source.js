@@ -42,6 +42,7 @@ async function openManifest(url, signal) {
     );
   }
   if (typeof manifest?.live === "string") return liveSource(beside(manifest.live, url));
+  if (Array.isArray(manifest?.parts)) return liveSource(new URL(url), (await import("./live-parts.js")).LiveParts);
   const renditions = [manifest, ...(manifest.renditions ?? [])].map((entry, i) => ({
     name: entry.name ?? (i ? `rendition ${i}` : "full"),
     gaussians: entry.gaussians ?? null,
@@ -53,11 +54,11 @@ async function openManifest(url, signal) {
   return { segments, frames: last - segments[0].first + 1, fps: manifest.fps ?? null, renditions, poster };
 }
 
-/** A stream as it is written, at the address of its socket. Only who looks at one loads what it takes. */
-async function liveSource(address) {
-  if (/^https?:$/.test(address.protocol)) address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
+/** A stream as it is written, from its socket or by another `Link`. Only who looks at one loads what it takes. */
+async function liveSource(address, Link) {
+  if (!Link && /^https?:$/.test(address.protocol)) address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
   const { LiveBuffer } = await import("./live.js");
-  const follow = (stream) => new LiveBuffer(address.href, stream);
+  const follow = (stream) => new LiveBuffer(address.href, stream, Link);
   return { live: true, follow, segments: [], frames: null, fps: null, renditions: [] };
 }
 

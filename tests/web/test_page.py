@@ -284,7 +284,7 @@ def test_the_page_is_small(site):
     sizes = {str(name): len(gzip.compress((site / name).read_bytes())) for name in files}
     # What only a live stream takes, a seek by a join, a stream without a package, a packet with a field, a headset and
     # the statistics is loaded only there. Layers, which encoders make unless they are told otherwise, count.
-    names = ("live", "live-socket", "latency", "joins", "file", "statistics", "xr", "changes/field")
+    names = ("live", "live-socket", "live-parts", "latency", "joins", "file", "statistics", "xr", "changes/field")
     later = [sizes.pop(f"{name}.js") for name in names]
     assert len(sizes) > 20
     assert sum(sizes.values()) <= 60_000

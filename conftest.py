@@ -41,6 +41,7 @@ LONG = (
     "flow/test_cost_follows_change", "flow/test_bad_input",
     "web/test_page_joins", "flow/test_checks", "packet/test_fuzz", "flow/test_run_ends", "flow/test_watch",
     "flow/test_worlds", "input/prepare/test_validate", "lab/tests/test_tune", "queen/tests/test_queen_stream",
+    "lab/tests/test_batch", "store/test_run_by_address", "store/test_fetch", "web/test_many_viewers",
     "tools/test_soak", "flow/test_still_frames", "packet/test_corrupt", "input/seeds/test_depth_maps",
     "input/recordings/test_layouts",
     "flow/test_light_process", "player/test_player_memory", "evaluation/test_evaluation", "lab/tests/test_compare",

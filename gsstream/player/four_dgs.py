@@ -23,7 +23,7 @@ from gsstream.player.activated import Activated
 #: A coefficient above degree 0 is one of 256 steps from -REACH to REACH.
 REACH = 4.0
 #: Bytes at the peak of the library for every number that is written.
-_PEAK = 60
+_PEAK = 40
 
 
 class Lives(NamedTuple):

@@ -22,7 +22,7 @@ PRIM = "/stream"
 #: The colour space of pictures as recorded, by its name in USD.
 _COLOURS = "srgb_rec709_scene"
 #: Bytes at the peak for every byte of the samples.
-_PEAK = 3
+_PEAK = 2
 
 
 def require_usd() -> None:

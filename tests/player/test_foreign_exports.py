@@ -365,7 +365,7 @@ def test_mistakes_are_named(tmp_path, moving, kind, monkeypatch, capsys):
         with pytest.raises(InputError, match="one or more in order of time"):
             export(moving, tmp_path / "out", kind, frames=frames)
     with pytest.raises(InputError, match=r"writing .* takes about"):
-        export(moving, tmp_path / "out", kind, max_memory=400_000)
+        export(moving, tmp_path / "out", kind, max_memory=300_000)
     package = {"usd": "pxr", "4dgs": "fourdgs"}[kind]
     monkeypatch.setitem(sys.modules, package, None)
     assert run_command(["export", str(moving), "--format", kind, "--out", str(tmp_path / "out")]) == 2

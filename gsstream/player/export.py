@@ -175,7 +175,7 @@ def _world_of_files(playback: Playback, frames: Sequence[int], kind: str, origin
     if origin != "recording":
         raise InputError(f"origin: expected recording or local, got {origin!r}")
     scene = playback.state_at(frames[0]) if frames else None
-    if scene is None or len(scene) == 0 or world.is_identity:
+    if scene is None or len(scene) == 0 or playback.meta.world.is_identity:
         return world
     step = float(np.spacing(np.float32(np.abs(world.points(scene.means)).max())))
     smallest = world.scale * float(np.exp(np.median(scene.scales.min(1))))

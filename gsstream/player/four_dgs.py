@@ -99,7 +99,7 @@ def write_4dgs(
     options = fourdgs.WriteOptions(metadata=facts, library="gsstream")
     try:
         fourdgs.write(str(path), scene, float(times[-1]), options=options)
-    except fourdgs.FourdgsError as error:
+    except (fourdgs.FourdgsError, ValueError) as error:  # of numbers beyond 32 bits it says ValueError
         raise InputError(f"the library of 4dgs refuses these frames: {error}; export ply") from error
 
 

@@ -317,6 +317,7 @@ def test_lives_tell_every_frame_again():
         ("glb", {"scales": 90.0}, r"1 of 5 Gaussians are larger .*export ply"),
         ("usd", {"scales": 90.0}, r"1 of 5 Gaussians are larger .*export ply"),
         ("4dgs", {"scales": 90.0}, r"1 of 5 Gaussians are larger .*export ply"),
+        ("4dgs", {"means": 1e9}, r"the library of 4dgs refuses these frames: .*32 bits.*export ply"),
     ],
 )
 def test_what_a_format_cannot_hold_is_refused(tmp_path, kind, changes, message):
@@ -327,6 +328,18 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path, kind, changes, message):
     with pytest.raises(InputError, match=message):
         export(stream, tmp_path / "out", kind)
     assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["glb", "usd", "4dgs"])
+def test_a_stream_in_its_recordings_axes_loses_nothing_far_away(tmp_path, kind):
+    """Its positions are float32 already, and there is no offset to leave out."""
+    scene = make_scene(0, 5, 15)
+    scene.means[2] = 1e7
+    (file,) = export(make_stream(tmp_path / "s.gss", 1, scene=scene), tmp_path / "out", kind)
+    if kind == "glb":
+        found = np.linalg.norm(read_glb(file.read_bytes())[1]["POSITION"].astype(float), axis=1)
+        assert found.max() == pytest.approx(1e7 * 3**0.5, rel=1e-6)
+    assert file.stat().st_size > 0
 
 
 def test_no_gaussians_are_refused_where_no_reader_takes_them(tmp_path):

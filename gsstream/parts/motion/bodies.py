@@ -48,11 +48,16 @@ def form_bodies(center: FloatArray, unit: FloatArray, values: FloatArray, curvat
     side = float(unit[0] / unit[3])
     arm: FloatArray = center - center.mean(0)
     lever: FloatArray = np.tile(np.eye(6), (len(center), 1, 1))
-    lever[:, :3, 3:] = -2 / side * _cross_matrices(arm)
+    lever[:, :3, 3:] = 2 / side * np.cross(np.eye(3), arm[:, None]).transpose(0, 2, 1)  # of a product with the arm
     motion: FloatArray = values * unit
     motion[:, :3] -= _shift_by_turn(motion[:, 3:], arm)
     weight = lever.transpose(0, 2, 1) @ curvature @ lever
-    first, common = _joined(_neighbours(center, REACH * side), motion / unit, weight, most)
+    # It takes a while to import, and only streams whose groups move need it.
+    from scipy.spatial import KDTree
+
+    first, common = _joined(
+        KDTree(center).query_pairs(REACH * side, p=np.inf, output_type="ndarray"), motion / unit, weight, most
+    )
     motion = common[first] * unit
     motion[:, :3] += _shift_by_turn(motion[:, 3:], arm)
     return Bodies(np.unique(first, return_inverse=True)[1], motion / unit, lever)
@@ -102,21 +107,7 @@ def _costs(pairs: IntArray, motion: FloatArray, weight: FloatArray) -> FloatArra
     return np.asarray(0.5 * (gap.transpose(0, 2, 1) @ weight[one] @ share)[:, 0, 0])
 
 
-def _neighbours(center: FloatArray, reach: float) -> IntArray:
-    """[E, 2] pairs of groups whose centres [K, 3] are at most ``reach`` apart along every axis."""
-    # It takes a while to import, and only streams whose groups move need it.
-    from scipy.spatial import KDTree
-
-    pairs: IntArray = KDTree(center).query_pairs(reach, p=np.inf, output_type="ndarray")
-    return pairs
-
-
 def _shift_by_turn(turn: FloatArray, arm: FloatArray) -> FloatArray:
     """[K, 3] how far turns [K, 3], axis * tan(angle / 2), move the ends of arms [K, 3]."""
     turned = quat_to_rotmat(rodrigues_to_quat(turn)) @ arm[..., None]
     return np.asarray(turned[..., 0] - arm)
-
-
-def _cross_matrices(v: FloatArray) -> FloatArray:
-    """[K, 3, 3] matrices by which to multiply for the cross product of v [K, 3] with something."""
-    return np.cross(v[:, None], np.eye(3)).transpose(0, 2, 1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +14,10 @@ from gsstream.core.shapes import FloatArray
 from gsstream.parts.motion.bodies import Bodies, form_bodies
 from gsstream.parts.motion.fitting import found_transforms, narrow_to
 from gsstream.parts.render.work import FitContext
-from gsstream.parts.render.wrt import WrtTransforms
+from gsstream.parts.render.wrt import LossAndGrad, WrtTransforms
+
+#: Pixels that a prediction must move some group for shares of it to be compared, and views that they are compared in.
+FAR, LOOKS = 1.0, 2
 
 
 class Damping(NamedTuple):
@@ -142,15 +147,43 @@ def fit_transforms_newton(
     base, local = narrow_to(work, start)
     per_step = torch.from_numpy(unit).to(base.means.device)
     squares = torch.outer(per_step, per_step)
-    descent = DampedNewton(torch.cat([local.translation, local.rotation], 1) / per_step, damping)
+
+    def compared(numbers: torch.Tensor, view: int, curvature: bool = False) -> LossAndGrad[torch.Tensor]:
+        now = numbers * per_step
+        wrt = WrtTransforms(base, local._replace(translation=now[:, :3], rotation=now[:, 3:]), curvature)
+        return work.loss_and_grad(view, wrt, "changed")
+
+    begin = torch.cat([local.translation, local.rotation], 1) / per_step
+    if float(begin.abs().max()) > FAR:
+        begin = begin * share_of_prediction(begin, compared, range(0, views, -(-views // LOOKS)))
+    descent = DampedNewton(begin, damping)
     for step in range(iterations):
         if step % views == 0:
             sequence = order.permutation(views)
         if step == views and settings.most:
             descent.join_neighbours(start.center, unit, settings)
-        now, view = descent.values * per_step, int(sequence[step % views])
-        transforms = local._replace(translation=now[:, :3], rotation=now[:, 3:])
-        found = work.loss_and_grad(view, WrtTransforms(base, transforms, curvature=step < views), "changed")
+        found = compared(descent.values, int(sequence[step % views]), curvature=step < views)
         curvature = None if found.curvature is None else found.curvature * squares * values
         descent.step(found.grad * per_step * values, curvature)
     return found_transforms(descent.values * per_step)
+
+
+def share_of_prediction(
+    predicted: torch.Tensor, compared: Callable[[torch.Tensor, int], LossAndGrad[torch.Tensor]], views: Iterable[int]
+) -> float:
+    """Return how much of a predicted motion [K, 6] explains some views best: all of it, nothing, or the way back.
+
+    Where a body stops or turns back, the fit would begin once or twice its way off, which is farther than it comes, and
+    what is lost so is not found again: the next frame's prediction is of the wrong motion.
+
+    Arguments:
+        predicted: shift and turn of every group, pixels.
+        compared: what a motion and the number of a view come to.
+        views: numbers of the views.
+    """
+    best, least = 1.0, math.inf
+    for share in (1.0, 0.0, -1.0):
+        if (loss := sum(float(compared(share * predicted, view).loss) for view in views)) >= least:
+            break  # the farther from it, the worse
+        best, least = share, loss
+    return best

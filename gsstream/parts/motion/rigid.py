@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, NamedTuple, final
+from typing import Any, ClassVar, final
 
 import numpy as np
 from pydantic import Field
@@ -26,18 +26,6 @@ DAMPING = 0.1
 BODY_HOLD = 500.0
 #: Longest step of a group, pixels at a width of 320.
 LONGEST = 0.5
-
-
-class Units(NamedTuple):
-    """Steps that move a group by a pixel: ``translation`` [scene units], ``rotation`` [tan(angle / 2)] at its edge."""
-
-    translation: float
-    rotation: float
-
-    @property
-    def row(self) -> FloatArray:
-        """[6] units of translation and rotation, side by side."""
-        return np.array([self.translation] * 3 + [self.rotation] * 3)
 
 
 @final
@@ -82,18 +70,16 @@ class Rigid(MotionPart):
         able = changed_groups(groups, work, config.votes, config.share)
         if not able.any():
             return ()
-        # The scene changes little between key packets, so a pixel is measured once, when its groups are formed.
-        pixel = groups.cell / side
-        # Half a cell from the centre, an angle a moves a point by a * cell / 2 = tan(a / 2) * cell.
-        units = Units(pixel, pixel / groups.cell)
+        # What moves a group by a pixel, scene units, and its edge, tan(angle / 2): half a cell from the centre, an
+        # angle a moves a point by a * cell / 2 = tan(a / 2) * cell. The scene changes little between key packets, so a
+        # pixel is measured once, when its groups are formed.
+        unit = np.array([groups.cell / side] * 3 + [1 / side] * 3)
         start = predict_transforms(scene, groups, able.astype(np.uint8), predicted=True)
-        found = self._fitted(work, start, units, rng)
-        steps = np.float32(config.step * units.translation), np.float32(config.step * units.rotation)
-        step = np.array([float(steps[0])] * 3 + [float(steps[1])] * 3)
+        found = self._fitted(work, start, unit, rng)
+        step = (config.step * unit).astype(np.float32).astype(np.float64)
         predicted = np.concatenate([start.translation, start.rotation], 1)
         symbols = np.rint((found - predicted) / step).astype(np.int32)
-        total = np.abs((predicted + symbols * step) / units.row).max(1)
-        kept = total >= config.least
+        kept = np.abs((predicted + symbols * step) / unit).max(1) >= config.least
         moving = np.zeros(groups.count, np.uint8)
         moving[np.flatnonzero(able)[kept]] = 1
         return (
@@ -102,20 +88,22 @@ class Rigid(MotionPart):
                 brightness_bins=groups.brightness_bins,
                 moving=moving,
                 symbols=symbols[kept],
-                translation_step=float(steps[0]),
-                rotation_step=float(steps[1]),
+                translation_step=float(step[0]),
+                rotation_step=float(step[3]),
             ),
         )
 
-    def _fitted(self, work: FitContext, start: GroupTransforms[FloatArray], units: Units, rng: Rng) -> FloatArray:
+    def _fitted(self, work: FitContext, start: GroupTransforms[FloatArray], unit: FloatArray, rng: Rng) -> FloatArray:
         """[K, 6] shift and turn of the groups that explain the images best."""
-        config = self.config
-        total = work.scaled(config.epochs * len(work.cameras))
-        damping = Damping(DAMPING, config.hold, LONGEST * enlargement(work.cameras.width))
+        config, cameras = self.config, work.cameras
         # The part of noise in a sum of so many values grows as the root of their number.
-        values = 3 * work.cameras.height * work.cameras.width * len(work.cameras)
-        bodies = BodySettings(config.body_cost * values**0.5, BODY_HOLD)
-        order = rng.numpy("motion", work.index)
+        most = config.body_cost * (3 * cameras.height * cameras.width * len(cameras)) ** 0.5
         return fit_transforms_newton(
-            work, start, units.row, iterations=total, order=order, damping=damping, settings=bodies
+            work,
+            start,
+            unit,
+            iterations=work.scaled(config.epochs * len(cameras)),
+            order=rng.numpy("motion", work.index),
+            damping=Damping(DAMPING, config.hold, LONGEST * enlargement(cameras.width)),
+            settings=BodySettings(most, BODY_HOLD),
         )

@@ -17,9 +17,15 @@ from gsstream.engine.step.context import EngineContext
 from gsstream.packet import PlayerState
 from gsstream.parts.motion.fitting import narrow_to
 from gsstream.parts.motion.groups import changed_groups, known_groups, pixel_size
-from gsstream.parts.motion.newton import BodySettings, DampedNewton, Damping, fit_transforms_newton
+from gsstream.parts.motion.newton import (
+    BodySettings,
+    DampedNewton,
+    Damping,
+    fit_transforms_newton,
+    share_of_prediction,
+)
 from gsstream.parts.render.transforms import Pinhole, curvature_of
-from gsstream.parts.render.wrt import WrtTransforms
+from gsstream.parts.render.wrt import LossAndGrad, WrtTransforms
 from gsstream.testing.cases import get_case
 from gsstream.testing.method_driver import FitFixture, fit_fixture
 
@@ -170,14 +176,34 @@ def test_nothing_that_changed_holds_nothing() -> None:
     assert not found.curvature.any()
 
 
+@pytest.mark.parametrize("went", [1.0, 0.6, 0.3, 0.0, -0.3, -0.7, -1.0])
+def test_a_fit_begins_at_the_share_of_a_prediction_that_the_pictures_are_nearest_to(went: float) -> None:
+    """Losses of two views that disagree about the place are weighed together."""
+    predicted = torch.tensor([[3.0, -1.0, 0.5, 0, 0, 0], [0.0, 2.0, 0.0, 1.0, 0, 0]])
+    asked: list[int] = []
+
+    def compared(values: torch.Tensor, view: int) -> LossAndGrad[torch.Tensor]:
+        asked.append(view)
+        return LossAndGrad((values - went * predicted + 0.2 * (1 - view)).square().sum(), values)
+
+    nearest = min((1.0, 0.0, -1.0), key=lambda share: abs(share - went))
+    assert share_of_prediction(predicted, compared, (0, 2)) == nearest
+    assert set(asked) == {0, 2}
+    assert len(asked) <= 6
+
+
+@pytest.mark.parametrize("ahead", [-2.0, 0.0, 0.9, 4.0])
 @pytest.mark.parametrize("settings", [BodySettings(0.0, 500.0), BodySettings(200.0, 500.0)])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_body_that_moved_is_found_where_it_went(seed: int, settings: BodySettings) -> None:
-    """The pictures are renders of a cloud of which one half moved by a pixel or two and turned by a degree or two."""
+def test_a_body_that_moved_is_found_where_it_went(seed: int, settings: BodySettings, ahead: float) -> None:
+    """The pictures are renders of a cloud of which one half moved by a pixel or two and turned by a degree or two.
+
+    It was expected ``ahead`` times as far: it went on, stood before, stops or turned back.
+    """
     cloud, work, rng = get_case("cloud"), fit_fixture().work, np.random.default_rng(seed)
     cameras, gaussians = cloud.cameras, cloud.gaussians.map(torch.Tensor.numpy)
     rows = np.flatnonzero(gaussians.means[:, 0] < np.median(gaussians.means[:, 0]))
-    pixel, zeros = pixel_size(gaussians.means, cameras), np.zeros((1, 3))
+    pixel = pixel_size(gaussians.means, cameras)
     centre = gaussians.means[rows].mean(0, keepdims=True, dtype=np.float64)
     shift, turn = pixel * rng.uniform(-2, 2, (1, 3)), rng.uniform(-0.02, 0.02, (1, 3))
     moves = GroupTransforms(rows, np.zeros(len(rows), np.int64), centre, shift, turn)
@@ -193,7 +219,7 @@ def test_a_body_that_moved_is_found_where_it_went(seed: int, settings: BodySetti
     images = np.stack([seen(blank).shown(after, view).numpy() for view in range(len(cameras))])
     arm = float(np.linalg.norm(gaussians.means[rows] - centre, axis=1).mean())
     unit, order = np.array([pixel] * 3 + [pixel / arm] * 3), np.random.default_rng(0)
-    start = moves._replace(translation=zeros, rotation=zeros)
+    start = moves._replace(translation=ahead * shift, rotation=ahead * turn)
     found = fit_transforms_newton(seen(images), start, unit, 8 * len(cameras), order, Damping(0.1, 1.0, 0.5), settings)
     wanted = np.concatenate([shift, turn], 1)
     before, now = np.abs(wanted / unit).max(), np.abs((found - wanted) / unit).max()

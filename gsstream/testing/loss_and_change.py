@@ -50,7 +50,7 @@ def check_loss_reference(part: Renderer) -> None:
 
 @check("renderer")
 def check_loss_mask(part: Renderer) -> None:
-    """With a mask, the sum runs over marked tiles and those beside them; a full mask equals none, an empty one gives 0."""
+    """With a mask the sum runs over marked tiles and those beside; a full mask equals none, an empty one gives 0."""
     one = torch.zeros(3, 3, dtype=torch.bool)
     one[0, 0] = True
     _agrees(part.loss, 0.2, one)

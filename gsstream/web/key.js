@@ -11,7 +11,7 @@ import { parseMeta } from "./meta.js";
 import { decodeSymbols, within } from "./symbols.js";
 import { decompress } from "./vendor/fzstd.js";
 
-/** What only some streams take: `layers` and `field` decode these sections once who meets one has loaded their modules. */
+/** What decodes these sections, once its module is loaded. */
 export const later = { layers: null, field: null };
 
 /**

@@ -5,9 +5,8 @@ import { SourceError, bytesOf, fileOf } from "./download.js";
 import { FORMAT_MAJOR, FORMAT_MINOR } from "./limits.js";
 import { PacketWalker } from "./walker.js";
 
-const LAYERS = 11;
-/** What only streams with such a section take: they wait for it. */
-const MODULES = { 10: "./changes/field.js", [LAYERS]: "./layers.js" };
+/** The numbers of two sections. */
+const [FIELD, LAYERS] = [10, 11];
 
 /**
  * Find out what is at `url`: `{ segments, frames, fps, renditions }`.
@@ -118,7 +117,8 @@ export async function* packetsOf(segment, signal, onPart) {
     walker ??= make();
     walker.push(chunk);
     for (let packet = walker.next(); packet; packet = walker.next()) {
-      for (const section of sectionsOf(packet.data)) if (MODULES[section]) await import(MODULES[section]);
+      // What only streams with a field take.
+      if ([...sectionsOf(packet.data)].includes(FIELD)) await import("./changes/field.js");
       yield packet;
     }
     if (walker.ahead(17)?.[16] === LAYERS) onPart?.(walker);

@@ -2,7 +2,7 @@
 
 // All modules at once: one that another one asks for would come a round trip later.
 const MODULES = "stream decode packing source buffer walker download changes/motion changes/residual changes/rows symbols";
-const MORE = "key meta attributes bits container history errors limits texels vendor/fzstd";
+const MORE = "key layers meta attributes bits container history errors limits texels vendor/fzstd";
 
 const begun = new Map();
 const waiting = [];

@@ -6,6 +6,7 @@ import { PacketBuffer } from "./buffer.js";
 import { copied, decodePacket } from "./decode.js";
 import { forbidden } from "./download.js";
 import { PacketError } from "./errors.js";
+import { look } from "./layers.js";
 import { Packer } from "./packing.js";
 import { openSource } from "./source.js";
 
@@ -178,7 +179,7 @@ export class Stream {
     this.packets = 0;
     this.key = false;
     // A part of a packet may be enough for a first picture.
-    const early = (walker) => this.state || import("./layers.js").then(({ look }) => look(this, walker), () => {});
+    const early = (walker) => this.state || look(this, walker);
     this.buffer = this.source.follow?.(this) ?? new PacketBuffer(segments, () => this._news(), early);
     this.buffer.fps = this.source.fps ?? 30;
     this.target = this.buffer.live ? null : (frame ?? this.buffer.first ?? 0);

@@ -183,14 +183,3 @@ def test_a_damaged_layer_does_no_harm(tmp_path, where):
     assert "damaged" in results[6]
     assert results[7] is None
     assert messages == []
-
-
-@needs_browser
-def test_a_stream_without_layers_loads_nothing_for_them(tmp_path):
-    key, _ = layered()
-    package(written(tmp_path, encode_key(key)), tmp_path / "site")
-    with serving(tmp_path / "site") as (url, server):
-        in_browser(at(url, [["go", "URL/index.html"], READY]), tmp_path, size=(64, 48))
-        asked = {path for path, _ in server.requests}
-    assert "/decode.js" in asked
-    assert "/layers.js" not in asked

@@ -177,7 +177,7 @@ def row_of(facts: dict[str, Any], page: str, runs: Sequence[dict[str, Any]]) -> 
         "decoded": runs[0]["decoded"],
         "longest_task_ms": max(run["longest"]["cpu"] for run in runs),
         "tasks_above_16_ms": max(run["long"] for run in runs),
-        "ms_a_picture": round(sorted(run["perPicture"] for run in runs)[len(runs) // 2], 1),
+        "thread_ms_each_picture": round(sorted(run["perPicture"] for run in runs)[len(runs) // 2], 1),
     }
 
 

@@ -59,13 +59,13 @@ class RecordedSource(CameraSource):
 
     def __init__(self, recording: Recording, *, scale: float = 1.0, uri: str) -> None:
         self._recording = recording
-        rig = checked_rig(recording)
         if len(set(recording.sizes.values())) > 1:
             told = ", ".join(f"{name} {w} x {h}" for name, (w, h) in recording.sizes.items())
             raise SourceError(
                 f"{recording.where}: all cameras of a rig must share one image size, got {told}; to bring pictures to "
                 f"one size: {prepare_command(uri)}"
             )
+        rig = checked_rig(recording)
         self._target = scaled_size((rig.width, rig.height), scale)
         self._alignment = align(recording.name, recording.clips)
         self._undistort: dict[str, Undistortion] = {}

@@ -15,7 +15,6 @@ from gsstream.input.recordings.calibration import CALIBRATION_FILE, Calibration,
 from gsstream.input.recordings.clips import Clip, ImageClip
 from gsstream.input.recordings.pointfiles import POINTS_FILE, read_points
 from gsstream.input.recordings.recorded import Recording, SeenPoints
-from gsstream.input.recordings.rigs.camera import say_unused
 from gsstream.input.recordings.video import VideoClip
 
 
@@ -30,13 +29,11 @@ def read(folder: Path) -> Recording:
     check_files(folder, known)
     train, test = known.train, known.test
     rig = train.joined(test)
-    clips = {name: _clip(folder, known, name) for name in rig.ids}
-    say_unused(folder / CALIBRATION_FILE, clips, flat=False)
     return Recording(
         name=known.name,
         where=str(folder / CALIBRATION_FILE),
         rig=rig,
-        clips=clips,
+        clips={name: _clip(folder, known, name) for name in rig.ids},
         test=test.ids,
         fps=known.fps,
         lenses=known.lenses,

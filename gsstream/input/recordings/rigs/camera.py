@@ -92,10 +92,10 @@ def assembled_rig(
     )
 
 
-def say_unused(where: Path, clips: Mapping[str, Clip], named: Collection[Path] = (), *, flat: bool = True) -> None:
+def say_unused(where: Path, clips: Mapping[str, Clip], named: Collection[Path] = ()) -> None:
     """Warn of pictures and videos beside those of these cameras that no camera has.
 
-    ``named``: those of which something was said already. ``flat``: look into folders that cameras share, too.
+    ``named``: those of which something was said already.
     """
     used = {path for clip in clips.values() for path in clip.files} | set(named)
     known = used | {path.parent for path in used}
@@ -106,7 +106,7 @@ def say_unused(where: Path, clips: Mapping[str, Clip], named: Collection[Path] =
     for parent in sorted({place.parent for place in alone}):
         beside = (folder for folder in folders_in(parent) if folder not in known and folder.name != FOLDER)
         found += [folder for folder in beside if images_in(folder)]
-    for place in sorted(set(homes) - films - alone if flat else ()):
+    for place in sorted(set(homes) - films - alone):
         found += images_in(place)
     if other := list(dict.fromkeys(path.name for path in found if path not in known)):
         some = ", ".join(other[:8]) + (", ..." if len(other) > 8 else "")

@@ -106,11 +106,15 @@ def declared(films: bool) -> Reader:
                 write_frames(folder / name, shown.pictures[:, c], digits=6)
             entries.append(
                 {
-                    "id": name, "split": "test" if c == 0 else "train", "width": scenes.SIZE[0],
-                    "height": scenes.SIZE[1], "K": shown.Ks[c].tolist(), "w2c": shown.poses[c].tolist(),
+                    "id": name,
+                    "split": "test" if c == 0 else "train",
+                    "width": scenes.SIZE[0],
+                    "height": scenes.SIZE[1],
+                    "K": shown.Ks[c].tolist(),
+                    "w2c": shown.poses[c].tolist(),
                     "frames": f"{name}.mkv" if films else f"{name}/%06d.png",
                 }
-            )  # fmt: skip
+            )
         data = {"schema": "opencv-multiview-1", "cameras": entries}
         (folder / "cameras.json").write_text(json.dumps(data if films else data | {"frames": FRAMES, "fps": RATE}))
         if not films:
@@ -182,9 +186,14 @@ def llff(scheme: str, style: str, at: str) -> Reader:
             write_video(path, world().pictures[:, int(path.stem.lstrip("cam_"))], rate=RATE)
 
     edits: Edits = {
-        "unknown": NO_KEYS, "refused": NO_KEYS, "nan": cell(3, np.nan), "turn": cell(0, 5.0),
-        "pose": rows(lambda data: data[:3]), "fisheye": NO_LENS, "lens": NO_LENS,
-    }  # fmt: skip
+        "unknown": NO_KEYS,
+        "refused": NO_KEYS,
+        "nan": cell(3, np.nan),
+        "turn": cell(0, 5.0),
+        "pose": rows(lambda data: data[:3]),
+        "fisheye": NO_LENS,
+        "lens": NO_LENS,
+    }
     return Reader(write, scheme, tuple(cam.format(c) for c in range(4)), at, "poses_bounds.npy", edits)
 
 
@@ -260,8 +269,13 @@ def panoptic() -> Reader:
     at = "ims/{c}/{t:06d}.png"
     return Reader(
         lambda folder: scenes.write_panoptic(folder, world()) and None,
-        "panoptic", ("0", "1", "2", "3"), at, "train_meta.json", edits, relist,
-    )  # fmt: skip
+        "panoptic",
+        ("0", "1", "2", "3"),
+        at,
+        "train_meta.json",
+        edits,
+        relist,
+    )
 
 
 # COLMAP ------------------------------------------------------------------------------------------------------

@@ -46,9 +46,9 @@ def last_line(text: str, key: str, value: str) -> str:
 
 def toml(text: str, key: str, value: str) -> str:
     word = {"NaN": "nan", "Infinity": "inf", "1e999": "1e308", "null": '"null"'}.get(value, value)
-    without = re.sub(rf"\n{key} = [^\n]*", "", text, count=1)
-    return without.replace("size =" if key != "size" else "matrix =", f"{key} = {word}\n" + (
-        "size =" if key != "size" else "matrix ="), 1)  # fmt: skip
+    anchor = "matrix =" if key == "size" else "size ="
+    plain = re.sub(rf"\n{key} = [^\n]*", "", text, count=1)
+    return plain.replace(anchor, f"{key} = {word}\n{anchor}", 1)
 
 
 def attribute(anchor: str, prefix: str = "") -> Set:
@@ -101,11 +101,20 @@ TEXTS = re.compile(
 
 #: Keys that another one goes before, which is therefore taken out.
 BEFORE: dict[str, tuple[str, ...]] = {
-    "camera_angle_x": ("fl_x", "fl_y"), "camera_angle_y": ("fl_x", "fl_y"), "x_fov": ("fl_x", "fl_y"),
-    "y_fov": ("fl_x", "fl_y"), "D_*": ("dist_00",), "R_*": ("Rot_00",), "K": ("camera_matrix",), "rvec": ("R",),
-    "Rot": ("R",), "tvec": ("T",), "distortion": ("distortion_coefficients",), "D": ("distortion_coefficients",),
+    "camera_angle_x": ("fl_x", "fl_y"),
+    "camera_angle_y": ("fl_x", "fl_y"),
+    "x_fov": ("fl_x", "fl_y"),
+    "y_fov": ("fl_x", "fl_y"),
+    "D_*": ("dist_00",),
+    "R_*": ("Rot_00",),
+    "K": ("camera_matrix",),
+    "rvec": ("R",),
+    "Rot": ("R",),
+    "tvec": ("T",),
+    "distortion": ("distortion_coefficients",),
+    "D": ("distortion_coefficients",),
     "dist": ("distortion_coefficients",),
-}  # fmt: skip
+}
 #: Keys that are no numbers of this object: they stand in the other one, or have numbers of their own.
 UNREAD: dict[str, list[str]] = {
     "layouts.nerfstudio._KEYS": ["time"],

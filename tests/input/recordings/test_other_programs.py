@@ -129,14 +129,25 @@ CONVERTED: dict[str, dict[str, Any]] = {
     "Polycam": {"camera_model": "OPENCV", "orientation_override": "none", "frames": entries(**OPTICS, **SIZE)},
     "Record3D": {**OPTICS, **SIZE, "camera_model": "OPENCV", "frames": entries()},
     "Metashape": {
-        **OPTICS, **SIZE, "k1": 0.0, "k2": 0.0, "k3": 0.0, "k4": 0.0, "p1": 0.0, "p2": 0.0, "camera_model": "OPENCV",
-        "frames": entries(), "applied_transform": [[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0]],
+        **OPTICS,
+        **SIZE,
+        "k1": 0.0,
+        "k2": 0.0,
+        "k3": 0.0,
+        "k4": 0.0,
+        "p1": 0.0,
+        "p2": 0.0,
+        "camera_model": "OPENCV",
+        "frames": entries(),
+        "applied_transform": [[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0]],
     },
     "RealityCapture": {
-        "camera_model": "OPENCV", "orientation_override": "none", **SIZE,
+        "camera_model": "OPENCV",
+        "orientation_override": "none",
+        **SIZE,
         "frames": entries(**OPTICS, **dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), "0")),
     },
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("program", CONVERTED)

@@ -1,7 +1,7 @@
 // A live stream in parts, from any web server: stands where a live stream has its socket (see live-socket.js).
 
 import { FILE_HEADER, PACKET_HEADER, parseHeader } from "./container.js";
-import { fileOf } from "./download.js";
+import { fileOf, refusal, settings } from "./download.js";
 
 /** Asks for the manifest again and again, and for the parts that it did not have. */
 export class LiveParts {
@@ -35,7 +35,7 @@ export class LiveParts {
     while (!on.signal.aborted) {
       let seconds = 1;
       try {
-        const manifest = JSON.parse(new TextDecoder().decode(await fileOf(this.buffer.url, on)));
+        const manifest = await this._manifest(on);
         seconds = manifest.seconds;
         for (const part of this._wanted(manifest.parts)) await this._take(part, on);
         this.buffer.said({ state: manifest.state, detail: manifest.detail });
@@ -48,6 +48,14 @@ export class LiveParts {
       }
       await new Promise((resolve) => setTimeout(resolve, 1000 * seconds));
     }
+  }
+
+  /** What there is. Not from the browser's own cache: servers date files by the second, and this one may be younger. */
+  async _manifest({ signal }) {
+    const patience = AbortSignal.any([signal, AbortSignal.timeout(settings.patience)]);
+    const answer = await settings.fetch(this.buffer.url, { signal: patience, cache: "no-store" });
+    if (!answer.ok) throw refusal(answer, this.buffer.url);
+    return answer.json();
   }
 
   /** The parts that follow what there is; where they do not, those since the newest key packet. */

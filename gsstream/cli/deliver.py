@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import threading
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,11 +13,14 @@ from gsstream.cli.listing import plural
 from gsstream.cli.streams import Frames, MaxMemory, Stream, fail_with, frame_range, progress_on, size_of, stream_file
 from gsstream.core.errors import InputError, OutputError
 from gsstream.core.memory import limited_memory
+from gsstream.store.address import is_address
 
 
 def export(
     stream: Stream,
-    to: Annotated[str, typer.Option("--out", help="Folder for the files; of a live page also s3://BUCKET/DIR.")],
+    to: Annotated[
+        str, typer.Option("--out", help="Folder for the files; of a page and a live page also s3://BUCKET/DIR.")
+    ],
     kind: Annotated[
         Literal["ply", "spz", "glb", "sequence", "usd", "4dgs", "manifest", "page", "live"],
         typer.Option("--format", help="PLYs, SPZs, GLBs, PLYs with a list; one file of OpenUSD or 4dgs; for the web."),
@@ -46,20 +50,16 @@ def export(
     (stream.json) holds no frame: it lists the byte ranges of all packets, so that any static web server can serve the
     stream. A live page shows a run while it is written: parts that never change, and a manifest that rolls.
     """
-    if kind == "live":
-        _live(stream, to)
-        return
-    out = Path(to)
-    first, last, most = *frame_range(frames), size_of(max_memory)
-    file = stream_file(stream)
-    if kind == "page":
-        if frames is not None:
-            raise InputError(f"--frames {frames}: a page holds all frames of a stream; leave --frames out")
-        with limited_memory(most):
-            _page(file, out, [stream_file(path) for path in rendition or []], join_every)
-        return
-    if rendition:
+    if rendition and kind != "page":
         raise InputError("--rendition is for --format page")
+    if kind in ("page", "live"):
+        with limited_memory(size_of(max_memory)):
+            _web(kind, stream, to, frames=frames, renditions=rendition or [], join_every=join_every)
+        return
+    if is_address(to):
+        raise InputError(f"--out {to}: only --format page and live go to an address; name a folder")
+    first, last = frame_range(frames)
+    most, file, out = size_of(max_memory), stream_file(stream), Path(to)
     if kind == "manifest":
         typer.echo(f"wrote {_manifest(file, out)}")
         return
@@ -75,6 +75,16 @@ def export(
     size = sum(path.stat().st_size for path in written)
     typer.echo(f"{out}: {plural(len(written), 'file')}, {size / 1e6:.1f} MB")
     fail_with(damage)
+
+
+def _web(kind: str, stream: Path, to: str, *, frames: str | None, renditions: list[Path], join_every: float) -> None:
+    """Write a page, recorded or live."""
+    if frames is not None:
+        raise InputError(f"--frames {frames}: a page holds all frames of a stream; leave --frames out")
+    if kind == "live":
+        _live(stream, to)
+    else:
+        _page(stream_file(stream), to, [stream_file(path) for path in renditions], join_every)
 
 
 def _live(stream: Path, to: str) -> None:
@@ -94,10 +104,20 @@ def _live(stream: Path, to: str) -> None:
         follower.close()
 
 
-def _page(stream: Path, out: Path, renditions: list[Path], join_every: float) -> None:
+def _page(stream: Path, to: str, renditions: list[Path], join_every: float) -> None:
     from gsstream.serve.package import package
 
-    done = package(stream, out, renditions=renditions, join_every=join_every)
+    if is_address(to):
+        from gsstream.serve.parts import bring_page
+        from gsstream.store.place import place_at
+
+        place = place_at(to)
+        with tempfile.TemporaryDirectory(prefix="page-") as folder:
+            package(stream, folder, renditions=renditions, join_every=join_every)
+            count = bring_page(Path(folder), place)
+        typer.echo(f"{place.address}: {plural(count, 'file')}")
+        return
+    done = package(stream, to, renditions=renditions, join_every=join_every)
     typer.echo(
         f"{done.folder}: {plural(done.segments, 'segment')}, {done.stream_bytes / 1e6:.2f} MB, "
         f"{plural(done.joins, 'join')}, {done.join_bytes / 1e6:.2f} MB, "

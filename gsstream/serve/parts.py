@@ -10,12 +10,13 @@ import time
 from collections.abc import Callable, Iterator
 from importlib import resources
 from importlib.resources.abc import Traversable
+from pathlib import Path
 from typing import Any
 
 from gsstream.core.errors import OutputError, PacketError
 from gsstream.packet import FORMAT_VERSION, Entry, PacketKind
 from gsstream.serve.follow import Follower
-from gsstream.serve.package import MANIFEST
+from gsstream.serve.package import MANIFEST, SEGMENTS
 from gsstream.store.place import Place
 from gsstream.store.troubles import StoreSilent
 
@@ -26,6 +27,8 @@ PART = 1.0
 KEPT = 60.0
 #: What HTTP says of each: a part never changes under its name, a manifest is looked at once a second for all viewers.
 FOR_EVER, FOR_A_SECOND = "public, max-age=31536000, immutable", "public, max-age=1"
+#: The same of a recorded page: its manifest, and its player.
+FOR_SECONDS, FOR_MINUTES = "public, max-age=5", "public, max-age=300"
 _NAME = re.compile(rf"{PARTS}/\d{{6,}}-[0-9a-f]{{12}}\.gss")
 
 
@@ -47,7 +50,7 @@ class LivePackage:
         """Put the player there, and take away the parts of an earlier stream. Raises OutputError."""
         self._gone = [(time.monotonic(), name) for name in self.place.names(f"{PARTS}/") if _NAME.fullmatch(name)]
         for name, data in _files(resources.files("gsstream") / "web", ""):
-            self.place.put(name, data, kept="public, max-age=300")
+            self.place.put(name, data, kept=FOR_MINUTES)
 
     def look(self) -> bool:
         """Write the packets that came since the last call, then the manifest. Returns whether the stream has ended.
@@ -127,6 +130,18 @@ class LivePackage:
             kept = {part["file"] for part in self._parts}
             self.place.remove(name for name in old if name not in kept)
             self._gone = [(at, name) for at, name in self._gone if name not in old]
+
+
+def bring_page(folder: Path, place: Place) -> int:
+    """Put a recorded page to a place, with what HTTP is to say of each file, the manifest last; return their number.
+
+    Files of an earlier page stay: a viewer may still watch it. Raises OutputError.
+    """
+    names = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*")) if path.is_file()]
+    for name in sorted(names, key=lambda name: (name == MANIFEST, name)):
+        kept = FOR_EVER if name.startswith(f"{SEGMENTS}/") else FOR_SECONDS if name == MANIFEST else FOR_MINUTES
+        place.put(name, (folder / name).read_bytes(), kept=kept)
+    return len(names)
 
 
 def _files(folder: Traversable, above: str) -> Iterator[tuple[str, bytes]]:

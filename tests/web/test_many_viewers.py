@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import hashlib
 import http.client
 import json
@@ -14,7 +15,7 @@ from urllib.parse import urlsplit
 import pytest
 import stores
 from browser_runs import MESSAGE, PLAYER, needs_browser
-from caching_proxy import origin, proxy
+from caching_proxy import origin, proxy, rules
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from live_runs import HEADER, Growing, assert_playable, browsing, live_socket, packets_from, served
@@ -261,6 +262,28 @@ def test_a_live_page_goes_to_a_store_with_its_headers(packets, tmp_path: Path) -
             for name in (part, "l/stream.json")
         }
         assert said == {part: live.FOR_EVER, "l/stream.json": live.FOR_A_SECOND}
+
+
+def test_a_page_goes_to_a_store_with_the_headers_of_the_how_to(
+    packets, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with StreamWriter.open(tmp_path / "s.gss") as writer:
+        for packet in packets:
+            writer.append(packet)
+    package(tmp_path / "s.gss", tmp_path / "page")
+    here = {path.relative_to(tmp_path / "page").as_posix(): path for path in (tmp_path / "page").rglob("*")}
+    with stores.bucket("page", tmp_path / "cache") as bucket:
+        to = f"{bucket.address}/p"
+        assert run_command(["export", str(tmp_path / "s.gss"), "--format", "page", "--out", to]) == 0
+        files = {name.removeprefix("p/"): data for name, data in bucket.files().items()}
+        assert files == {name: path.read_bytes() for name, path in here.items() if path.is_file()}
+        said = rules() | {"stream.json": "public, max-age=5"}
+        for name in files:
+            head = bucket.client.head_object(Bucket=bucket.name, Key=f"p/{name}")
+            assert head["CacheControl"] == next(kept for rule, kept in said.items() if fnmatch.fnmatch(name, rule))
+        capsys.readouterr()
+        assert run_command(["export", str(tmp_path / "s.gss"), "--format", "ply", "--out", to]) == 2
+        assert "only --format page and live go to an address" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

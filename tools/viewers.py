@@ -1,6 +1,7 @@
 """How many viewers one live server serves: delay from packet to viewer, and memory, for a growing number of them.
 
-Usage: python -m tools.viewers [--viewers 1 50 200 500] [--seconds 8] [--fps 10] [--packet 3000] [--out FILE.json]
+Usage: python -m tools.viewers [--viewers 1 50 200 500] [--relays 0] [--seconds 8] [--fps 10] [--packet 3000]
+                               [--out FILE.json]
 
 A server in a process of its own, a writer that appends packets at a rate, and viewers in this process, all on loopback.
 A viewer's delay is the time from the packet's last byte in the file to its last byte here.
@@ -18,7 +19,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from statistics import median, quantiles
 
@@ -31,10 +33,15 @@ from gsstream.packet.writer import StreamWriter
 
 _SERVE = """
 import sys
+from contextlib import nullcontext
+from pathlib import Path
+from gsstream.cli.open import relaying
+from gsstream.serve.relay import is_upstream
 from gsstream.serve.server import Server
-server = Server(sys.argv[1], live=True, port=0, max_viewers=int(sys.argv[2]))
-print(server.url, flush=True)
-server.run()
+with relaying(sys.argv[1]) if is_upstream(sys.argv[1]) else nullcontext(Path(sys.argv[1])) as stream:
+    server = Server(stream, live=True, port=0, max_viewers=int(sys.argv[2]))
+    print(server.url, flush=True)
+    server.run()
 """
 
 
@@ -111,11 +118,24 @@ def measure(url: str, pid: int, writer: Writer, viewers: int, seconds: float) ->
     }
 
 
+@contextmanager
+def _served(source: str, viewers: int) -> Iterator[tuple[str, int]]:
+    """A server of a file or, for the socket of another server, a relay, in a process: its address, and its number."""
+    command = [sys.executable, "-c", _SERVE, source, str(viewers)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stdout is not None
+            yield server.stdout.readline().strip(), server.pid
+        finally:
+            server.terminate()
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure every number of viewers and print a table of Markdown."""
     parser = argparse.ArgumentParser(prog="python -m tools.viewers", description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--viewers", type=int, nargs="+", default=[1, 50, 200, 500])
     parser.add_argument("--seconds", type=float, default=8.0)
+    parser.add_argument("--relays", type=int, default=0, help="between the server that has the file and the viewers")
     parser.add_argument("--fps", type=float, default=10.0)
     parser.add_argument("--packet", type=int, default=3000, metavar="BYTES")
     parser.add_argument("--out", type=Path)
@@ -128,18 +148,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         writer = Writer(stream, b"key", given.fps, given.packet)
         with StreamReader(stream) as reader:
             reader.check()
-        command = [sys.executable, "-c", _SERVE, str(stream), str(max(given.viewers) + 8)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
-            try:
-                assert server.stdout is not None
-                url = server.stdout.readline().strip()
-                writer.start()
-                for viewers in given.viewers:
-                    found.append(measure(url, server.pid, writer, viewers, given.seconds))
-                    print(json.dumps({key: round(value, 2) for key, value in found[-1].items()}), flush=True)
-            finally:
-                writer.stopped.set()
-                server.terminate()
+        with ExitStack() as stack:
+            source = str(stream)
+            for _ in range(1 + given.relays):
+                url, process = stack.enter_context(_served(source, max(given.viewers) + 8))
+                source = f"ws{url[4:]}live"
+            stack.callback(writer.stopped.set)
+            writer.start()
+            for viewers in given.viewers:
+                found.append(measure(url, process, writer, viewers, given.seconds))
+                print(json.dumps({key: round(value, 2) for key, value in found[-1].items()}), flush=True)
     print("| viewers | median delay, ms | 95 %, ms | KB a viewer |\n|--:|--:|--:|--:|")
     for row in found:
         numbers = f"{row['median_ms']:.1f} | {row['p95_ms']:.1f} | {row['kb_per_viewer']:.0f}"

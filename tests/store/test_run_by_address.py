@@ -154,7 +154,7 @@ def test_parts_that_the_file_no_longer_says_are_sent_again(tmp_path: Path, monke
     assert brought(b"ab") == b"ab"
 
 
-def wait_for(ready, seconds: float = 60.0) -> None:
+def wait_for(ready, seconds: float = 300.0) -> None:
     deadline = time.monotonic() + seconds
     while not ready():
         assert time.monotonic() < deadline, "it never came"

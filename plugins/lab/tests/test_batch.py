@@ -12,9 +12,10 @@ from pathlib import Path
 import batch_works
 import pytest
 import stores
+from gsstream_lab.batch import drive
 from gsstream_lab.batch.drive import MARGIN, run_batch
 from gsstream_lab.batch.plan import Task, read_batch
-from gsstream_lab.batch.work import NOTE, run_batch_job
+from gsstream_lab.batch.work import NOTE, BatchJob, run_batch_job
 from gsstream_lab.jobs.base import Finished
 from gsstream_lab.jobs.executor import LocalExecutor, make_executor
 
@@ -91,6 +92,8 @@ def test_on_ray_with_another_cache_the_bytes_are_the_same(
         tasks = tasks_of(tmp_path, f"{bucket.address}/takes/pickblocks_tiny_160")
         encoded(tasks[:1], f"{bucket.address}/one")
         monkeypatch.setenv("GSSTREAM_CACHE", str(tmp_path / "there"))
+        # More than any machine has: the largest has to do.
+        monkeypatch.setattr(drive, "BatchJob", lambda *a, **facts: BatchJob(*a, **(facts | {"memory": 1 << 50})))
         executor = make_executor(run_batch_job, 2, 1, ray="local")
         result, _ = encoded(tasks, f"{bucket.address}/two", executor)
         assert dict(result.failed) == {}

@@ -46,11 +46,15 @@ class RayExecutor:
         make = ray.remote(num_cpus=threads, max_calls=1, max_retries=0, runtime_env=environment)
         self._remote = make(work)
         self._running: dict[Any, str] = {}
+        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        #: Bytes of the largest machine: a task that asks for more would wait for ever.
+        self._most = int(max((resources.get("memory", 0) for resources in nodes), default=0))
 
     def submit(self, job: Any) -> None:
         """Add the job to the queue as a task."""
         # Another machine has no such folder; it takes its own for temporary files.
-        make = self._remote.options(memory=job.memory) if job.memory else self._remote
+        memory = min(job.memory, self._most)
+        make = self._remote.options(memory=memory) if memory else self._remote
         self._running[make.remote(replace(job, work=None))] = job.id
 
     def next(self) -> Finished:

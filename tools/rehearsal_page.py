@@ -106,4 +106,4 @@ def _free_port() -> int:
 def _psnr(one: Path, two: Path) -> float:
     with Image.open(one) as first, Image.open(two) as second:
         a, b = (np.asarray(image.convert("RGB"), np.float64) for image in (first, second))
-    return float(10 * np.log10(255**2 / max(np.mean((a - b) ** 2), 1e-9)))
+    return float(10 * np.log10(255**2 / max(float(np.mean((a - b) ** 2)), 1e-9)))

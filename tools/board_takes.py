@@ -5,8 +5,8 @@ Usage: python -m tools.board_takes [--cameras 12] [--pictures 100] [--close 15] 
 Cameras of 1280 x 720 pixels with bent lenses stand around a place, two metres from it. A board is carried through the
 middle, and close to each camera for its lens. Every picture in which a camera may see it is rendered (four samples a
 pixel, blur in pixels, noise in levels of 255) and given to the detector; what is found goes through ``gsstream
-calibrate board``'s own code. Prints one row of numbers: errors of corners, largest errors of directions, places and focal
-lengths, and what the calibration says of itself.
+calibrate board``'s own code. Prints one row of numbers: errors of corners, largest errors of directions, places and
+focal lengths, and what the calibration says of itself.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ from pathlib import Path
 from gsstream.packet.conformance import play_here
 from tools.conformance import (
     edits,
+    frames,
     keys,
     lying_deltas,
     lying_files,
@@ -30,7 +31,7 @@ FOLDER = Path(__file__).parents[2] / "tests" / "conformance"
 
 def all_vectors() -> Iterator[Vector]:
     """Every vector, in the order of the modules."""
-    sound = (keys, residuals, moving, edits, rounding)
+    sound = (keys, residuals, moving, edits, rounding, frames)
     for module in (*sound, lying_files, lying_keys, lying_metas, lying_deltas, lying_moves, lying_rows):
         yield from module.vectors()
 

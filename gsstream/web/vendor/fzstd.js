@@ -467,8 +467,14 @@ var rzb = function (dat, st, out) {
                 err(0);
             (s4 ? dhu4 : dhu)(dat.subarray(bt, bt += lcs), buf.subarray(spl), hu);
         }
+        // gsstream: literals that run past their block would be taken from what follows it.
+        if (bt >= ebt)
+            err(0);
         // num sequences
         var ns = dat[bt++];
+        // gsstream: without sequences a block ends here.
+        if (!ns && bt != ebt)
+            err(0);
         if (ns) {
             if (ns == 255)
                 ns = (dat[bt++] | (dat[bt++] << 8)) + 0x7F00;

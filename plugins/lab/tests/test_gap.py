@@ -123,3 +123,42 @@ def test_means_are_over_cameras_first_and_leave_out_what_is_not_defined() -> Non
     assert gap.mean("gap_psnr_changed_seen") == 4.5
     assert math.isnan(gap.mean("gap_psnr_moving", 2))
     assert gap.table().splitlines()[3].split()[1::2] == ["2", "10.00", "12.00", "+2.00", *"-" * 12]
+
+
+TURNED = "disturbed:ways=3:synthetic:frames=3&views=4&width=48&height=36&supersample=1&motion=4"
+
+
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run over a recording that is gone through there, back and there again: pictures 0 1 2 1 0 1 2."""
+    out = tmp_path_factory.mktemp("again") / "run"
+    encode(out, source=TURNED, method="s2gs-edge", first_frame__max_iterations=60)
+    return out
+
+
+def test_what_a_stream_loses_is_what_it_has_where_the_same_pictures_come_again(
+    turned: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Picture 1 is shown once each way, the ends less often; all numbers against the run's own measurements."""
+    assert run_command(["gap", str(turned), "--again", "--source", TURNED, "--json"]) == 0
+    rows = {row.pop("frames"): row for row in json.loads(capsys.readouterr().out)}
+    lines = metrics(turned)
+    assert list(rows) == ["1 to 1", "3 to 3", "5 to 5", "dB in 100 frames", "frame 0", "frame 4"]
+    for frame in (1, 3, 5):
+        row = rows[f"{frame} to {frame}"]
+        assert row["whole"] == pytest.approx(lines[frame]["psnr"]["test"], abs=1e-3)
+        assert row["changed"] == pytest.approx(lines[frame]["psnr_changed"]["test"], abs=1e-3)
+    by_hand = np.polyfit([1, 3, 5], [rows[f"{t} to {t}"]["whole"] for t in (1, 3, 5)], 1)[0] * 100
+    assert rows["dB in 100 frames"]["whole"] == pytest.approx(by_hand)
+    assert rows["frame 4"]["changed"] is None, "where the first picture is shown again, all that changed came back"
+    with Playback(turned / "stream.gss") as stream:
+        image = np.clip(render(stream.state_at(4), stream.meta.test, 0, stream.meta.background), 0, 1)
+    truths = [open_source(TURNED.split(":", 2)[2]).frame(t, "test").images[0] for t in range(3)]
+    ever = np.any([changed_mask(truth, truths[0]) for truth in truths], axis=0)
+    assert rows["frame 4"]["still"] == pytest.approx(psnr(image, truths[0], ~ever))
+    assert rows["frame 4"]["came back"] == pytest.approx(psnr(image, truths[0], ever))
+
+
+def test_a_recording_that_shows_nothing_again_has_no_second_time(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["gap", str(run), "--again"]) == 2
+    assert "disturbed:ways=3:URI" in capsys.readouterr().err

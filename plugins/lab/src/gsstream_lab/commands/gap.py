@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,7 +15,9 @@ from gsstream.cli.streams import check_recipe, named_recording, progress_on, str
 from gsstream.core.errors import InputError
 
 if TYPE_CHECKING:
+    from gsstream_lab.gap.again import Again
     from gsstream_lab.gap.fresh import FreshFrames
+    from gsstream_lab.gap.measure import Gap
 
 
 def gap(
@@ -34,6 +37,10 @@ def gap(
     source: Annotated[
         str | None, typer.Option("--source", help="The recording; default: the one the stream was made from.")
     ] = None,
+    again: Annotated[
+        bool,
+        typer.Option("--again", help="Compare with the first time instead, where a recording shows pictures again."),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Every view of every frame as JSON, for scripts.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only the table, warnings and errors.")] = False,
 ) -> None:
@@ -43,15 +50,17 @@ def gap(
     on where it was stopped. The table (gap.txt) and every number (gap.json) are written beside the stream, and the
     contact sheet shows both close up. Give enough passes: below about 150, a fresh reconstruction may be worse than the
     cameras allow, and the gap too small.
+
+    With --again nothing is reconstructed: of a recording that goes there and back again (disturbed:ways=3:URI) the
+    table says what each time that it is gone through has lost of the first.
     """
     from gsstream.discovery.catalog import load_catalog
-    from gsstream.engine.run.output import write_whole
     from gsstream.engine.run.recording import open_recording
-    from gsstream.evaluation.gallery import write_sheet
     from gsstream.player.playback import Playback
     from gsstream.recipe.load import load_recipe
+    from gsstream_lab.gap.again import measure_again
     from gsstream_lab.gap.fresh import FreshFrames, check_cameras
-    from gsstream_lab.gap.measure import GAP_FILES, default_frames, measure_gap
+    from gsstream_lab.gap.measure import default_frames
 
     file = stream_file(run)
     if not run.is_dir() or not (run / "recipe.yaml").is_file():
@@ -61,20 +70,30 @@ def gap(
         frames, meta = playback.frames, playback.meta
     check_recipe(file, meta.recipe)
     chosen = _frames(at, frames) if at is not None else default_frames(frames)
-    recording = open_recording(source or named_recording(file, meta, catalog), recipe, catalog)
-    try:
+    with closing(open_recording(source or named_recording(file, meta, catalog), recipe, catalog)) as recording:
         check_cameras(meta, recording.info)
-        fresh = FreshFrames.of_run(recipe, recording, cache or run / "fresh", catalog=catalog, epochs=epochs)
-        for frame in chosen:
-            _make(fresh, frame, quiet)
-        files = {frame: fresh.file(frame).resolve() for frame in chosen}
-        found = measure_gap(file, files, recording, fresh.epochs, progress=progress_on("frame"))
-        for name, text in zip(GAP_FILES, (found.table(), found.to_json()), strict=True):
-            write_whole(run / name, text + "\n")
-        write_sheet(run, recording, files)
-    finally:
-        recording.close()
+        if again:
+            found: Again | Gap = measure_again(file, recording, progress=progress_on("frame"))
+        else:
+            fresh = FreshFrames.of_run(recipe, recording, cache or run / "fresh", catalog=catalog, epochs=epochs)
+            found = _from_fresh(run, file, fresh, chosen, quiet=quiet)
     typer.echo(found.to_json() if as_json else found.table())
+
+
+def _from_fresh(run: Path, file: Path, fresh: FreshFrames, chosen: list[int], *, quiet: bool) -> Gap:
+    """Make the reconstructions that are not there yet, compare, and write what was found beside the stream."""
+    from gsstream.engine.run.output import write_whole
+    from gsstream.evaluation.gallery import write_sheet
+    from gsstream_lab.gap.measure import GAP_FILES, measure_gap
+
+    for frame in chosen:
+        _make(fresh, frame, quiet)
+    files = {frame: fresh.file(frame).resolve() for frame in chosen}
+    found = measure_gap(file, files, fresh.source, fresh.epochs, progress=progress_on("frame"))
+    for name, text in zip(GAP_FILES, (found.table(), found.to_json()), strict=True):
+        write_whole(run / name, text + "\n")
+    write_sheet(run, fresh.source, files)
+    return found
 
 
 def _make(fresh: FreshFrames, frame: int, quiet: bool) -> None:

@@ -68,7 +68,7 @@ def files_asked(root: Path, change: Change) -> list[str]:
         text = path.read_text(encoding="utf-8")
         named, slow = naming.search(text) is not None, f'/{path.stem}"' in long
         runs = path.is_relative_to(flow)
-        # Of the tests of other packages only the fast ones: browsers take longer than what they find is worth.
+        # Only the fast tests of other packages are run: a browser takes longer than its findings are worth.
         if path.is_relative_to(own) or runs or (named and not slow and path.parent.name != "web"):
             ranks.append((runs, slow, not named, len(text), path.relative_to(root).as_posix()))
     return [path for *_, path in sorted(ranks)]

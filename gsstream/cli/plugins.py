@@ -22,7 +22,7 @@ def plugins(
 ) -> None:
     """List all plugins and the parts they ship, or show one part.
 
-    Of a part: its settings with their defaults, ranges and meaning, and which methods set them.
+    For a part, the settings are shown with their defaults, ranges and meaning, and the methods that set them.
     """
     if part is not None:
         _show(part)

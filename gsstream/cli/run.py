@@ -171,7 +171,7 @@ def _what_there_is(error: GsstreamError, out: Path, recording: Source, wanted: M
     from gsstream.engine.run.session import METRICS, RunResult
 
     if isinstance(error, RecipeError | OutputError):
-        return  # refused before anything was done, or the folder takes no files: pictures would say nothing or fail
+        return  # nothing was done, or the folder takes no files: there is nothing to draw, or no place for it
     try:
         done = last_written(out / METRICS) + 1 if (out / METRICS).exists() else 0
         if done == 0:

@@ -45,8 +45,8 @@ class Part(ABC):  # noqa: B024 - each kind adds what is abstract
     ``source``: origin of the idea, for listings: a citation such as ``"S2GS, section 3.2"``, or the name of the
     distribution that had it first.
 
-    ``processor_only``: why the part cannot work with tensors of a GPU; empty where it can. A run with it renders on the
-    processor.
+    ``processor_only``: why the part cannot work with tensors of a GPU; empty where it can. A run with such a part
+    renders on the processor.
 
     ``denied``: checks of the contract kit that the part cannot pass -> why not, in 20 characters or more. They are made
     all the same and must fail: a denial that is no longer true is itself a failure.

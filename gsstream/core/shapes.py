@@ -59,7 +59,7 @@ def check_shape(name: str, array: Any, expected: Sequence[int | str]) -> dict[st
 def check_finite(name: str, array: Any) -> None:
     """Raise ShapeError naming the first non-finite index of a numpy array or torch tensor.
 
-    Of a tensor on a GPU no index is named, and the error may come later (``gsstream.core.deferred``).
+    For a tensor on a GPU no index is named, and the error may come later (``gsstream.core.deferred``).
     """
     if hasattr(array, "detach") and array.device.type != "cpu":
         message = f"{name}: expected finite values, got some that are not"

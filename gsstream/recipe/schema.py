@@ -56,7 +56,7 @@ def _slot(
     slot: str, field: Schema, parts: Mapping[str, PartSchema], default: str | None, definitions: Schema
 ) -> Schema:
     """A bare name, or {name, params}; the name decides which settings are known."""
-    # The default of a slot need not be the name of a part: that of the renderer is "auto".
+    # The default of a slot need not be the name of a part: the default of the renderer is "auto".
     names = list(dict.fromkeys([Recipe.model_fields[slot].default.name, *parts]))
     keys: set[str] = set()
     cases = []

@@ -117,7 +117,7 @@ class Follower:
         try:
             return self.read(last)[: PACKET_HEADER.size] == self._header
         except PacketError:
-            return not self._header  # it was damaged when it came
+            return not self._header  # the packet was damaged when it came
 
     def _begin(self, size: int) -> None:
         self.close()
@@ -167,7 +167,7 @@ def writer_is_gone(folder: Path) -> bool:
     except ProcessLookupError:
         return True
     except FileNotFoundError:
-        # A run lets go of its folder when it ends. Beside a stream that somebody else writes there are no such files.
+        # A run lets go of its folder when it ends. A stream that another program writes has no such files beside it.
         return any((folder / name).exists() for name in RUN_FILES[1:])
     except (OSError, ValueError, KeyError, TypeError):
         return False

@@ -112,7 +112,7 @@ def _old_files(folder: Path) -> set[str]:
         raise OutputError(
             f"{folder} holds something that is no package: expected an empty folder, a new one, or one with {MANIFEST}"
         ) from error
-    # Only what a package names there: a manifest that somebody else wrote removes nothing beyond its own segments.
+    # Only names that packages give to segments are removed: a manifest that somebody else wrote removes no other file.
     return {name for name in files if Path(name).parent == Path(SEGMENTS) and Path(name).suffix in (".gss", ".gsj")}
 
 

@@ -21,7 +21,7 @@ from gsstream.testing.registry import kind_of
 
 EXACT = "bitwise: the same operations on the same numbers"
 ROUNDING = "float32 rounding over a few hundred terms"
-#: Share of the largest gradient of a scene. A gradient that is smaller than this share all over, such as
+#: Tolerance as a share of the largest gradient of a scene. A gradient that is smaller than this share all over, such as
 #: the gradient of the rotation of round Gaussians, is the rest of large terms that cancel: its digits are rounding.
 FLOOR = 0.01
 

@@ -67,7 +67,7 @@ def check_loss_mask(part: Renderer) -> None:
 
 @check("renderer")
 def check_loss_bytes(part: Renderer) -> None:
-    """A target of bytes is the image that it stands for, bit for bit."""
+    """A target of bytes gives the bits that its float32 image gives."""
     image, target = _pair()
     codes = (target * 255).round().to(torch.uint8)
     (value, gradient), (want, wanted) = (

@@ -74,7 +74,7 @@ class Controller:
         entry["actual"] = {name: actual[name] for name in limits}
         entry["violated"] = [name for name, limit in limits.items() if actual[name] > limit]
         log.set(budget=entry)
-        # As it will be read back: a resumed run must plan with the same numbers.
+        # The line is noted as it will be read back: a resumed run must plan with the same numbers.
         self._note(json.loads(json.dumps({"frame": step.packet.frame, "status": step.status, **log.entry()})))
 
     def _note(self, metrics: Mapping[str, Any]) -> None:

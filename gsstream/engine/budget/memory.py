@@ -21,8 +21,8 @@ WAITING = 4
 #: Images of float32 that are made for one camera at a time: renders, gradients, maps of the loss, and the temporary
 #: images of every phase (measured at widths of 320 and 1352).
 WORKING = 8
-#: Bytes of a Gaussian with its gradients and moments in frame 0; and of the copies that a later frame makes of it, when
-#: there are caches.
+#: Bytes of a Gaussian with its gradients and moments in frame 0; bytes of the copies that a later frame makes of a
+#: Gaussian, when there are caches.
 BYTES_PER_GAUSSIAN, BYTES_PER_GAUSSIAN_LATER = 1_700, 700
 #: Share of the memory beside the images that Gaussians get; caches get the rest (250 bytes per camera and Gaussian).
 FOR_GAUSSIANS = 0.6

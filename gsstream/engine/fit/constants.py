@@ -20,7 +20,7 @@ GATE_LR = 0.1
 #: are fifteen times as long.
 DENSIFY_FROM, DENSIFY_EVERY = 300, 100
 #: Mean screen gradient, in half image widths, above which a Gaussian is densified: 2e-4 in 3DGS.
-#: Wider pictures than 320 pixels have a lower one (core/picture_size.py).
+#: Pictures wider than 320 pixels have a lower threshold (core/picture_size.py).
 DENSIFY_GRADIENT = 3e-4
 #: Share of the iterations after which nothing is densified or pruned any more.
 DENSIFY_UNTIL = 0.6

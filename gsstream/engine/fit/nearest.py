@@ -14,7 +14,7 @@ ALONE = 0.01
 def neighbour_distance(positions: torch.Tensor) -> torch.Tensor:
     """Return [N] float32: root mean squared distance to the three nearest other points, as in 3DGS.
 
-    With fewer than three others: to those.
+    With fewer than three other points, the mean is over as many as there are.
 
     Points at one place are neighbours at distance 0. A point alone is taken to be 0.01 from another.
 

@@ -58,7 +58,7 @@ def random_signs(like: torch.Tensor, generator: torch.Generator) -> torch.Tensor
     Eight are drawn at a time: one by one they take as long as a render of a large picture.
     """
     drawn = torch.randint(0, 256, (-(-like.numel() // 8),), generator=generator, dtype=torch.uint8)
-    # As bytes, a quarter of the size of the floats that they become: the signs may have to cross to a GPU.
+    # The signs are bytes, a quarter of the size of the floats that they become: they may have to cross to a GPU.
     bits = torch.from_numpy(np.unpackbits(drawn.numpy(), count=like.numel())).to(like.device)
     return bits.to(like.dtype).mul_(2).sub_(1).reshape(like.shape)
 

@@ -165,7 +165,7 @@ class FirstFrameRun:
         values = {name: value.to(self.device) for name, value in start.items()}
         self.table = RowParameters(values, first_frame_lrs(self.settings, self.extent), assembly.renderer.optimiser)
         self._set_level(pyramid.levels[0], None)
-        #: Colour maps that are fitted along; None: those of the photometric loss stay.
+        #: Colour maps that are fitted together with the scene; None: the colour maps of the photometric loss stay.
         self.exposure: ExposureFit | None = None
         self.statistics = DensifyStatistics.zeros(len(start), self.device)
         self.regularisers = choose_regularisers(self.settings, frame.cameras)

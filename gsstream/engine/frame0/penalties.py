@@ -1,8 +1,9 @@
 """What Gaussians cost besides errors in the pictures: opacity, size, and the pixels that they cover. Ours.
 
 Pictures alone do not ask for small Gaussians: many wide and faint ones on top of each other show what a few small ones
-show. Every covered pixel is blended in every iteration and whenever the stream is drawn, though. With a price on it, a
-pixel of a large picture blends three tenths fewer of them, at nearly equal quality (docs/results/extremes.md).
+show. Every covered pixel is blended in every iteration and whenever the stream is drawn, though. With a price on the
+number of Gaussians, a pixel of a large picture blends three tenths fewer of them, at nearly equal quality
+(docs/results/extremes.md).
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def add_penalty_grad(
     gradients.scales.add_(sizes, alpha=constants.SCALE_PENALTY / (3 * count * extent))
     if area_price == 0:
         return
-    # Axis by axis, each in a row of its own: numbers by row and by axis are slow to multiply.
+    # Every axis has a row of its own, because tables whose columns are the axes are slow to multiply.
     away = _by_axis(scene.means) - center[:, None]
     x2, y2, z2 = away * away
     focal2 = float(cameras.Ks[view, 0, 0] * cameras.Ks[view, 1, 1])

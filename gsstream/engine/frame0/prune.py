@@ -25,7 +25,7 @@ MAX_LOGIT = 7.0
 #: Factor by which the error of the images may grow when all pruned Gaussians are left out; the fit that follows closes
 #: such gaps.
 GROWTH = 1.25
-#: Most times that fewer Gaussians are tried instead, each time those of a quarter of the error.
+#: How often fewer Gaussians are tried instead, each time those that together add a quarter of the error.
 TRIES = 8
 
 

@@ -24,7 +24,7 @@ from gsstream.packet.grids import KEY_BITS, color_codes, color_grads, from_codes
 from gsstream.parts.render.exposure import Exposure
 
 #: How far a code may move, in steps of its grid: a colour by 0.04, an axis by 7 degrees, a scale by a factor of 2.7, an
-#: opacity by a logit. View-dependent colour may go to zero from anywhere.
+#: opacity by a logit. View-dependent colour may be rounded to zero from any value.
 REACH: Mapping[str, int] = {"quats": 8, "scales": 16, "opacities": 8, "sh0": 8}
 #: Probes of a camera.
 HUTCHINSON_SAMPLES = 2

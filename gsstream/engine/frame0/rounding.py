@@ -30,7 +30,7 @@ def rd_codes_to_zero(exact: FloatArray, sensitivity: FloatArray, weight: float) 
 
     def candidate_codes(nearest: IntArray) -> IntArray:
         towards = np.sign(nearest)
-        # A code of 1 has no neighbour two towards zero on its side of it.
+        # A code of 1 has no neighbour two steps towards zero on its own side of zero.
         second = np.where(np.abs(nearest) > 1, nearest - 2 * towards, 0)
         return np.stack([nearest, nearest - towards, second, np.zeros_like(nearest)])
 

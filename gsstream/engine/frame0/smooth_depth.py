@@ -40,7 +40,7 @@ class SmoothDepth:
         self._edges: dict[int, list[torch.Tensor]] = {}
 
     def add_grad(self, rows: Gaussians[torch.Tensor], view: int, grad: Gaussians[torch.Tensor], weight: float) -> None:
-        """Add to ``grad``, in place, that of ``weight`` times the roughness of a view."""
+        """Add to ``grad``, in place, the gradient of ``weight`` times the roughness of a view."""
         leaves = rows.map(lambda value: value.detach().clone().requires_grad_())
         loss = self.mean_roughness(leaves, view)
         if not loss.requires_grad:  # nothing is drawn

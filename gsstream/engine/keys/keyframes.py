@@ -116,7 +116,8 @@ def _key_step(
     anchors = decoded_anchors(state.player)
     hierarchy, levels, gaussians = sort_into_nodes(assembly, gaussians, levels, anchors)
     layout = make_layout(hierarchy, levels, anchors)
-    # A resumed run must compare the next frame with the picture this scene shows, which may be an older one.
+    # A resumed run must compare the next frame with the picture that this scene shows, which may be the picture of an
+    # older frame.
     meta = replace(meta, extra={**meta.extra, SHOWN: shown})
     first = first_layer_mask(assembly, gaussians, frame, exposure=state.exposure, rng=rng) if layered else None
     meta = key_meta(meta, state.exposure, anchors.origin)

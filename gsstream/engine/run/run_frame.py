@@ -99,7 +99,7 @@ def run_resume(method: StreamingMethod[Any], player: PlayerState, shown: Frame, 
 def _tried(
     work: Callable[[Frame], Step[Any]], frame: Frame, tools: RunTools
 ) -> tuple[Step[Any], ComponentError | ShapeError | None]:
-    """What the work makes of a frame; where it fails and the recipe says so, of the same frame skipped, and why."""
+    """The step of a frame; where ``work`` fails and the recipe says so, the step that skips it, and the error."""
     mark = tools.log.mark()
     try:
         return work(frame), None

@@ -197,7 +197,7 @@ class _Run:
         if self.encoder.controller is not None:
             self.encoder.controller.remember(kept)
         if last is None and wanted is not None:
-            stream.unlink()  # it may hold sound packets of frames that are made again
+            stream.unlink()  # the file may hold sound packets of frames that are made again
         if last is not None and wanted is None:
             self._measure_again(kept, last)
         return last

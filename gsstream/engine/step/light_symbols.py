@@ -50,7 +50,7 @@ def with_light(
     """Return the delta in which rows behind closed gates change colour, too: a latent more, whose decoder is new.
 
     Arguments:
-        delta: of a frame; its gates stay, and what is behind them. layout: that of the rows.
+        delta: the delta of a frame; its gates stay, and so does what is behind them. layout: the layout of the rows.
         change, worth, price: as :func:`light_symbols` takes them, of all N rows.
         decoder: [L, 3] of sh0, for a delta that has none. step: of its latents. levels: of a gate.
     """

@@ -191,7 +191,7 @@ RESOLUTION = 2.0**-24
 def count_dead_gates(gate: GateSampler, logits: torch.Tensor) -> int:
     """Count the gates with these logits [M] that neither the images nor the price can move.
 
-    Of a dead gate the derivatives of the deterministic gate and of the open probability are below RESOLUTION.
+    A gate is dead where the derivatives of the deterministic gate and of the open probability are below RESOLUTION.
     """
     leaf = logits.detach().clone().requires_grad_()
     with torch.enable_grad():

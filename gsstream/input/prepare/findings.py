@@ -36,7 +36,7 @@ class Finding:
 
 
 def error(code: str, message: str) -> Finding:
-    """Return a finding with which a scene is not worth a run."""
+    """Return a finding that makes a run of the scene a waste of time."""
     return Finding(code, "error", message)
 
 

@@ -1,4 +1,4 @@
-"""Poses and lenses of raw cameras that are known before anything is matched: those of a calibration, in any layout."""
+"""Poses and lenses of raw cameras that a calibration states, in any layout, before anything is matched."""
 
 from __future__ import annotations
 

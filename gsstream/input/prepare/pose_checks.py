@@ -1,7 +1,7 @@
 """Do the pictures of one instant fit the poses, or those poses read by another convention?
 
 No feature is matched: small pictures are swept by planes, and what counts is how much of their texture lies, at some
-depth, where the neighbours see the same. With wrong poses, next to no texture agrees.
+depth, where the neighbours see the same. With wrong poses, nearly no texture agrees.
 """
 
 from __future__ import annotations

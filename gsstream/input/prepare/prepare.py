@@ -40,12 +40,12 @@ Say = Callable[[str], None]
 class PrepareOptions:
     """How a scene is made."""
 
-    test: tuple[str, ...] | None = None  # ids of test cameras; None: those of a given calibration
+    test: tuple[str, ...] | None = None  # ids of test cameras; None: the test cameras of a given calibration
     without: tuple[str, ...] = ()  # ids of cameras that are left out
     model: str = "SIMPLE_RADIAL"  # lens model of structure from motion (a key of ``seeds.mapping.LENSES``)
     each: bool = False  # every camera has a lens of its own; else all share one where all pictures have one size
     frames: int | None = None  # at most so many frames; None: all
-    #: Pictures are shrunk to this width; None: that of the smallest camera. Pictures of other shapes are shrunk
+    #: Pictures are shrunk to this width; None: to the width of the smallest camera. Pictures of other shapes are shrunk
     #: evenly and cut around their middle.
     width: int | None = None
     max_points: int = 50_000  # points kept
@@ -191,7 +191,7 @@ def _pinholes(
 def _points(mapping: Mapping, rig: Cameras, options: PrepareOptions) -> tuple[PointCloud, FloatArray] | None:
     """Trustworthy points inside the bounds, thinned; bounds [2, 3]: the middle 98 % of them, and a tenth around.
 
-    None where so few were found that they say nothing: cameras far apart have no features in common.
+    None where too few matches were found to judge by: cameras far apart have no features in common.
     """
     if len(mapping.xyz) < MIN_POINTS:
         return None

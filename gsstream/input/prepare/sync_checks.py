@@ -28,8 +28,8 @@ PARTNERS = 12
 #: A clock counts as known from this correlation with the other cameras on, if the correlation falls by at least the
 #: second number away from the best offset.
 ALIKE, FALL = 0.3, 0.05
-#: Least offset that is claimed, frames; least gain of correlation by it, and the same times the frames squared (few
-#: frames say little); least share of the partners that agree.
+#: Least offset that is claimed, frames; least gain of correlation by an offset; least gain times the number of frames
+#: squared (a few frames prove little); least share of the partners that agree.
 LEAST, GAIN, GAIN_OF_FEW, VOTES = 0.7, 0.01, 12.0, 0.75
 #: So many of the cameras that are least like the others, and clearly less than usual, are tried with each other's pose;
 #: both must become so much more like the others.

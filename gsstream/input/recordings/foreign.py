@@ -34,7 +34,8 @@ class Keys:
     read: str
     #: Known, and without effect on poses, lenses, times and points.
     idle: str = ""
-    #: They say how to read numbers, and gsstream does not: refused unless they say nothing (zero, false, null, empty).
+    #: These keys change how numbers are to be read, which gsstream does not support: they are refused unless their
+    #: value has no effect (zero, false, null, empty).
     refused: str = ""
 
 

@@ -19,7 +19,7 @@ from gsstream.core.storage import unpacked
 PER_PIXEL, PER_AVERAGED = 20, 48
 #: Columns or rows that are averaged at a time: so few stay in a processor's cache.
 _LINES = 32
-#: What unpacks to more than this (bytes, and times its own size) is no recording.
+#: A file that unpacks to more bytes than this, and to more than this many times its own size, is no recording.
 _UNPACKED, _PACKED = 1 << 26, 100
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _RGB_COLOR_TYPE = b"\x02"

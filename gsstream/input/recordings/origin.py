@@ -18,9 +18,9 @@ _LONGEST = 1 << 16
 def public_uri(uri: str) -> str:
     """Return which recording an uri means without where it lies: this is what a stream, which is published, may say.
 
-    The demo and synthetic scenes stay as they are. Of a folder, and of the address of one, the last part is left,
-    behind the layout where one is stated; of a plugin's source only its name, because what follows may be an address
-    with a password.
+    The demo and synthetic scenes stay as they are. The origin of a folder, and of the address of one, is the last part
+    of its path, behind the layout where one is stated. That of a plugin's source is the name of the source alone,
+    because what follows may be an address with a password.
     """
     scheme, colon, rest = uri.partition(":")
     if uri == "demo" or (colon and scheme == "synthetic"):

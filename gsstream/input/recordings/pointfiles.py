@@ -96,7 +96,7 @@ def check_archive(path: Path) -> None:
         with zipfile.ZipFile(path) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
     except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):
-        return  # whoever reads it says what it is
+        return  # what reads the points refuses such a file, and says what is wrong
     check_unpacked(path, size, "these are no points; write the points alone, with numpy.savez")
 
 

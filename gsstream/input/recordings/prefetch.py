@@ -20,8 +20,8 @@ LARGE_PAIR = 64 << 20
 class Prefetcher:
     """Iterate (training frame, test frame) pairs in the given order, at most ``depth`` pairs ahead of the consumer.
 
-    An error while reading a frame is raised when its turn comes; iteration then ends, as it does where a growing
-    recording does. Use as a context manager, or call ``close``, so that threads end. ``depth`` None: 2, and 1 where the
+    An error while reading a frame is raised when its turn comes; iteration then ends, as at the end of a growing
+    recording. Use as a context manager, or call ``close``, so that threads end. ``depth`` None: 2, and 1 where the
     images of one pair take more than ``LARGE_PAIR``. ``pack``: images wait as bytes where bytes hold them.
     """
 

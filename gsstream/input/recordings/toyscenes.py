@@ -18,11 +18,11 @@ from gsstream.input.recordings.toyroom import moving_shapes, static_shapes
 SceneName = Literal["paths", "stop", "reversal", "bounce", "occlusion", "flash", "lamp", "dim"]
 #: Path of a body from one frame to the next with the option motion = 1, metres: about 5 pixels at a width of 160.
 STEP = 0.08
-#: Light of the frame of a flash, times that of the others.
+#: Light in the frame of a flash, as a multiple of the light in other frames.
 FLASH = 1.6
-#: Light from the frame on in which a lamp is switched on, times that before.
+#: Light after a lamp is switched on, as a multiple of the light before.
 LAMP = 1.3
-#: What is lost of the light in every frame in which it dims, and what is left of it in the end.
+#: Share of the light that is lost in every frame while the light dims, and the share that is left in the end.
 DIM, DARKEST = 0.0025, 0.6
 #: Scenes whose objects go the way of "paths", with another clock or none.
 _ON_PATHS = ("paths", "stop", "reversal", "flash", "lamp", "dim")
@@ -60,7 +60,8 @@ class ToyScene:
             return {shape.name: center for shape, center in moving_shapes(self.seed, self.phase(index))}
         way = STEP * self.motion * (index - self.event)
         if self.name == "bounce":
-            # Up and down between floor and 0.9 m, there and back between two walls nobody sees; the floor at frame E.
+            # A body that goes up and down between the floor and 0.9 m, and to and fro between two walls that no camera
+            # sees; at frame E it is on the floor.
             return {"ball": np.array([0.7, _zigzag(way, 0.8), 0.18 + _above(way, 0.72)])}
         return {"ball": np.array([0.75, _zigzag(way - 0.16, 1.1), 0.13])}
 

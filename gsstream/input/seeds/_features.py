@@ -19,7 +19,7 @@ from gsstream.core.processors import processors
 IMAGES = "images"
 #: Longer side of the pictures in which features are looked for.
 MOST_PIXELS = 1600
-#: With more images than this, those are matched first that are likely to show the same.
+#: With more images than this, images that are likely to show the same place are matched first.
 MOST_FOR_ALL_PAIRS = 30
 #: How far apart they are in the order of their names.
 NEIGHBOURS = 10

@@ -283,7 +283,7 @@ def _match(images: FloatArray, cameras: Cameras, view: int, depth: FloatArray, o
 def _drawn_on(
     grey: torch.Tensor, cameras: Cameras, view: int, points: FloatArray, shape: tuple[int, ...]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """A picture [H, W] drawn on places [P, 3], as an image of ``shape`` (P pixels), and where there is any of it."""
+    """A picture [H, W] drawn on places [P, 3]: an image of ``shape`` (P pixels), and which of its pixels are drawn."""
     uv, depth = project(points, cameras, view)
     grid = torch.from_numpy((uv / (cameras.width, cameras.height) * 2 - 1).astype(np.float32)).reshape(1, *shape, 2)
     drawn = F.grid_sample(grey[None, None], grid, align_corners=False, padding_mode="border")[0, 0]

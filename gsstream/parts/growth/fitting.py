@@ -15,7 +15,8 @@ from gsstream.parts.render.work import FitContext
 from gsstream.parts.render.wrt import WrtRows
 
 Array = TypeVar("Array", torch.Tensor, FloatArray)
-#: Learning rates: those of 3DGS at the start of training; positions in standard deviations of each Gaussian.
+#: Learning rates, those of 3DGS at the start of training; the rate of positions is in standard deviations of each
+#: Gaussian.
 RATES = {"means": 0.1, "quats": 1e-2, "scales": 0.02, "opacities": 0.1, "sh0": 0.02, "shN": 1e-3}
 BETAS, EPSILON = (0.9, 0.99), 1e-15
 

@@ -104,8 +104,8 @@ def elementwise(second: torch.Tensor) -> torch.Tensor:
 def groupwise_max(second: torch.Tensor) -> torch.Tensor:
     """Return the squared gradient [K, 1] that all six numbers of a group are divided by: the largest of them.
 
-    With a measure of its own every number would make steps of full size, those that the images say nothing about too
-    (depth, the turn of a ball), and so would groups that are hardly seen: noise, which the residual has to mend. A
-    group whose gradient is below the mean of all groups is divided by that mean.
+    With a measure of its own, every number would make steps of full size: also numbers that the images do not determine
+    (depth, the turn of a ball), and those of groups that are hardly seen. Such steps are noise, which the residual has
+    to mend. A group whose gradient is below the mean of all groups is divided by that mean.
     """
     return second.amax(1, keepdim=True).maximum(second.mean())

@@ -32,7 +32,8 @@ class BodySettings(NamedTuple):
     """When neighbouring groups are joined to bodies, and how strongly a body holds its groups."""
 
     most: float  # loss that joining a pair may cost, summed over the values of all images; 0: no bodies
-    hold: float  # curvature that draws a group to where its body takes it, summed likewise, per pixel^2
+    #: Curvature of the pull of a group towards the motion of its body, per pixel^2, summed over values of all images.
+    hold: float
 
 
 class DampedNewton:

@@ -1,7 +1,7 @@
 """The residual of all attributes side by side, as one table: a few large operations instead of many small ones.
 
-Latents of all attributes are the columns of one [A, L] table, their decoders the blocks of one [L, D] matrix (identity
-where an attribute has no decoder), and what changes the columns of one [A, D] table.
+Latents of all attributes are the columns of one [A, L] table. Their decoders are the blocks of one [L, D] matrix
+(identity where an attribute has no decoder). The changes of all attributes are the columns of one [A, D] table.
 """
 
 from __future__ import annotations

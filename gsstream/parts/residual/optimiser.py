@@ -15,7 +15,7 @@ from gsstream.parts.render.target import ViewTarget
 from gsstream.parts.render.wrt import WrtRows
 from gsstream.parts.residual.adam_state import AdamState
 
-#: The sessions of the renderer that an optimiser belongs to: those of other renderers do not reach it.
+#: The sessions of the renderer that an optimiser belongs to; sessions of other renderers are never given to it.
 S = TypeVar("S", bound=RenderSession)
 
 
@@ -60,7 +60,7 @@ class Gates(Protocol):
 
         Arguments:
             gates: [A] as sampled.
-            by_gate: [A] gradient of the loss by them.
+            by_gate: [A] gradient of the loss by the gates.
             position: [A, 3] ungated position residual with a graph, into which the penalty's gradient flows.
             frozen: [A] bool rows that cost nothing, because they are not trained yet; None: all rows are trained.
         """
@@ -98,7 +98,7 @@ class ResidualEpoch(Generic[S]):
     begin: Callable[[int], None] = lambda _: None
 
     def after(self, made: int) -> ResidualEpoch[S]:
-        """Return what is left after so many iterations; ``begin`` counts on."""
+        """Return the rest of the pass after so many iterations; ``begin`` goes on counting."""
         begin = self.begin
         return replace(self, iterations=self.iterations[made:], begin=lambda place: begin(made + place))
 

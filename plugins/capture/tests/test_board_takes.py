@@ -72,7 +72,7 @@ def test_a_board_on_glass_is_read_from_behind() -> None:
 
 
 def test_the_printed_page_is_the_board() -> None:
-    """As it is printed, at the size that it says."""
+    """The board is drawn as it is printed, at the size that its file says."""
     sheet = np.asarray(page(BOARD))
     small = cv2.resize(sheet, None, fx=0.2, fy=0.2, interpolation=cv2.INTER_AREA)
     found = Finder(BOARD).find(small)

@@ -162,7 +162,7 @@ def test_nothing_moves_a_gate_whose_level_waits(solve: Callable[..., Solution], 
 
 
 def test_open_gates_are_counted_after_every_epoch() -> None:
-    """As many as frames of one, two and three epochs end with."""
+    """After each epoch as many gates are open as at the end of a frame of so many epochs."""
     parts, problem = captured("s2gs-paper", ("gate.noise=none",))
 
     def of_epochs(number: int) -> EpochScheduler:

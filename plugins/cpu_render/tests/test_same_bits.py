@@ -77,7 +77,7 @@ def adam() -> list[Any]:
 
 
 def loss() -> list[Any]:
-    """Of all tiles, and of some."""
+    """The image of all tiles, and the image of some."""
     rng = np.random.default_rng(11)
     image, target = near_pair(rng, 210, 250)
     mask = rng.random(tile_shape(210, 250)) < 0.4

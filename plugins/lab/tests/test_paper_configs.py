@@ -89,7 +89,7 @@ def rows(points: dict[str, Cell]) -> dict[str, ResolvedRecipe]:
 
 
 def recipe_of(resolved: ResolvedRecipe, catalog: Catalog) -> Recipe:
-    """What the parts make of it."""
+    """What the parts make of the settings."""
     return assemble(resolved, catalog).recipe
 
 

@@ -253,7 +253,7 @@ QUOTED = {
 
 @pytest.mark.parametrize("path", sorted([*(ROOT / "sweeps").rglob("*.yaml"), *TABLES]), ids=lambda p: p.stem)
 def test_the_sweeps_that_ship_are_sound(path):
-    """Their keys, methods and files exist; a sweep of a table has a variant for each row that is ours to run."""
+    """Their keys, methods and files exist; a sweep of a table has a variant for each row whose method is shipped."""
     from gsstream_lab.report.paper import paper_table
 
     config = read_sweep(path)

@@ -19,7 +19,7 @@ FOLDER = Path(__file__).parent
 
 
 def write_network(path: Path, kind: str) -> str:
-    """change: min(1, 20 max |difference|); flow: that times (3, 4) pixels; raw: not a probability; one: one input."""
+    """change: min(1, 20 max |difference|); flow: the same times (3, 4) pixels; raw: no probability; one: one input."""
     from onnx import TensorProto, helper, numpy_helper
 
     def constant(name: str, values: object) -> object:

@@ -155,7 +155,7 @@ def test_residuals_of_offset_and_factor_are_an_offset_to_half_a_symbol() -> None
 Sparsity, Gate = ExpectedSparsity.Config, GumbelSigmoid.Config
 Octree, Gradient = StreamingOctree.Config, ViewSpaceGradient.Config
 RELEASED = Gradient(loss="l2norm", aggregate="sum-of-norms", normalisation="ratio")
-#: With other settings than their defaults; tests/contract/test_shipped_plugins.py checks the defaults.
+#: Parts with settings other than their defaults; tests/contract/test_shipped_plugins.py checks the defaults.
 PARTS = [
     StreamingOctree(Octree(gate_level=2)), StreamingOctree(Octree(grouping="gaussian")),
     ViewSpaceGradient(RELEASED), ViewSpaceGradient(Gradient(normalisation="minmax")),

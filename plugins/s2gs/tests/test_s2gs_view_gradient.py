@@ -73,7 +73,9 @@ class TestFormulas:
     def test_units(self) -> None:
         pixel = estimator(units="pixel", epsilon=0).estimate(told(magnitudes(list(self.values))))
         half = estimator(units="ndc", epsilon=0).estimate(told(magnitudes(list(self.values))))
-        torch.testing.assert_close(pixel, half)  # one view, one axis: a factor, and with epsilon 0 it cancels
+        torch.testing.assert_close(
+            pixel, half
+        )  # with one view and one axis the unit is a factor, and with epsilon 0 the factor cancels
         wide = dataclasses.replace(told(torch.ones(1, 3, 2)), cameras=dataclasses.replace(rig(1), width=200, height=50))
         assert estimator()._magnitudes(wide)[0].tolist() == pytest.approx([math.hypot(100, 25)] * 3)
 

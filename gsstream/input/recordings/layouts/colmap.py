@@ -1,6 +1,6 @@
 """A COLMAP model of frame 0 with the frames of its cameras: sparse/0/ beside images/, or beside videos.
 
-Of several models (sparse/0/, sparse/1/, ...) the one with the most images is read.
+Where there are several models (sparse/0/, sparse/1/, ...), the one with the most images is read.
 
 The model's images are the cameras. A camera is named after its image's own folder (``cam00/000000.png`` -> cam00) when
 every image has one, else after the image (``cam00.png`` -> cam00). Its frames are the folder of pictures or

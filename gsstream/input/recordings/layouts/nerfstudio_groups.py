@@ -97,7 +97,7 @@ def _checked(path: Path, cameras: dict[str, list[Entry]]) -> dict[str, list[Entr
 
 def _by_pose(frames: list[Entry], poses: FloatArray) -> list[list[Entry]]:
     """Entries whose pose and intrinsics agree, in the order of the file."""
-    # Thousands of poses are told apart by one number each; what is left is compared.
+    # Thousands of poses are sorted by one number each, so that only poses with nearly the same number are compared.
     flat = poses.reshape(len(poses), -1)
     weights = np.sqrt(np.arange(flat.shape[1]) + 2)
     keys, slack = flat @ weights, (_NEAR + 1e-5 * np.abs(flat)) @ weights

@@ -116,7 +116,8 @@ def say_unused(where: Path, clips: Mapping[str, Clip], named: Collection[Path] =
 def opencv_lens(values: Sequence[float], fisheye: bool, where: str) -> Lens:
     """Return the lens of OpenCV's coefficients: k1, k2, p1, p2, k3, k4, k5, k6, or k1 to k4 of a fisheye.
 
-    With s1 to s4 of a thin prism there are 12; of 14, the tilt must be zero. Zeros alone are no lens, however many.
+    There are 12 coefficients with s1 to s4 of a thin prism; where there are 14, the tilt must be zero. Zeros alone are
+    no lens, however many.
     """
     if fisheye and len(values) == 4:
         return Lens("fisheye", tuple(values))

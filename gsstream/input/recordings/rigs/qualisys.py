@@ -20,7 +20,7 @@ from gsstream.input.recordings.rigs.camera import RigCamera
 
 SUFFIXES = (".txt", ".xml")
 UNIT = 1 / 64
-#: Attributes of ``intrinsic``; those of the sensor and the lens in millimetres say nothing of pixels.
+#: Attributes of ``intrinsic``; attributes of the sensor and the lens in millimetres do not determine pixels.
 _KEYS = Keys(
     read="""
         focalLengthU focalLengthV centerPointU centerPointV radialDistortion1 radialDistortion2 radialDistortion3

@@ -137,7 +137,7 @@ def opening_of(camera: CameraSpec, folder: Path, where: str) -> Opening:
     if not separator:
         return Opening(str(folder / camera.url), kind="file")
     if scheme in ("rtsp", "rtsps"):
-        # Not less to probe: under load a camera then failed with "Invalid data found".
+        # FFmpeg probes as much as it likes: with less, a camera under load failed with "Invalid data found".
         return Opening(camera.url, None, {"rtsp_transport": camera.transport, "timeout": "3000000"}, "rtsp")
     if scheme in ("http", "https"):
         return Opening(camera.url, "mpjpeg", {"rw_timeout": "3000000"}, "http")
@@ -148,7 +148,7 @@ def opening_of(camera: CameraSpec, folder: Path, where: str) -> Opening:
 
 
 def _v4l2(query: str, where: str) -> dict[str, str]:
-    options = {"timestamps": "abs"}  # the kernel's time of a picture, as that of this machine's clock
+    options = {"timestamps": "abs"}  # the kernel's time of a picture, converted to the clock of this machine
     for key, value in parse_qsl(query, keep_blank_values=True):
         if key not in _V4L2:
             raise SourceError(f"{where}: unknown option {key!r}{suggest(key, _V4L2)}; all: {', '.join(_V4L2)}")

@@ -183,7 +183,7 @@ def block_sigma(means: FloatArray) -> float:
 def block_means(picture: Any) -> FloatArray:
     """Return [ceil(H / 4), ceil(W / 4), 3] means of [H, W, 3]; blocks at the border average the pixels they have.
 
-    Of int16 the sums are exact (they stay below 2^12), and a level is 1 / 255.
+    Sums of int16 are exact (they stay below 2^12), and a level is 1 / 255.
     """
     sums = _sums(_sums(picture).swapaxes(0, 1)).swapaxes(0, 1)
     if sums.dtype == np.int16:
@@ -217,7 +217,7 @@ def _at_most_rough(spread: float, means: FloatArray) -> float:
     if across:
         out = values[along:].reshape(rows, columns - 2, channels)
         _second_differences(means[:, :-2], means[:, 1:-1], means[:, 2:], out)
-    # The variance of a - 2 b + c is six times that of each.
+    # The variance of a - 2 b + c is six times the variance of each term.
     admitted = ChangeRule.MOST_OF_ROUGHNESS * ChangeRule.MAD_TO_SIGMA / np.sqrt(6)
     # Usually the bound is above the spread, and counting alone shows that; the margin is for rounding.
     if np.count_nonzero(values < spread / admitted * (1 + 1e-9)) < len(values) // 2:

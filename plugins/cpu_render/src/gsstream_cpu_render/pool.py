@@ -52,7 +52,7 @@ class Passes(ABC):
 class PooledRasterizer:
     """A rasteriser for one owner; its memory returns to the pool when the last reference to the lease goes.
 
-    With ``own`` its memory came from the system and goes back there.
+    With ``own``, the memory of the rasteriser came from the system and goes back there.
     """
 
     def __init__(self, rasterizer: NumpyRasterizer, own: bool) -> None:

@@ -60,8 +60,8 @@ class DisturbedSource(Wrapped):
 
     Frame t of the run is frame ``start + t + offset`` of the recording for each camera, where ``start`` makes room for
     negative offsets; the run is shorter by the span of the offsets, so that no frame of a camera is shown twice. With
-    several ways t goes there and back. Order: ways, time offset, gain (all cameras), noise, losses and the rounding of
-    storage (training cameras).
+    several ways, the recording is gone through forwards and backwards in turn. Order: ways, time offset, gain (all
+    cameras), noise, losses and the rounding of storage (training cameras).
     """
 
     def __init__(self, source: Source, disturbances: Disturbances, seed: int, uri: str) -> None:

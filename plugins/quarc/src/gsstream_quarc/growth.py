@@ -17,7 +17,7 @@ from gsstream.blocks import CopySettings, enlargement, least_opaque, pixel_size,
 class ChangeGatedCopies(Growth):
     """Copies Gaussians where four fixed views changed, at most four in a cell of a grid (QuARC-GS, 2026).
 
-    As many of the least opaque leave as there are more than the last key packet had.
+    As many of the least opaque Gaussians leave as the scene has more Gaussians than the last key packet.
     """
 
     source = "QuARC-GS (arXiv 2608.18285)"
@@ -54,7 +54,7 @@ def change_scores(work: FitContext, views: int) -> torch.Tensor:
     """Return [N] the change score g / (g + median) of every Gaussian, 0 to 1; 0 where g is 0.
 
     g is the length of the change, from the frame before to this one, of the squared error's gradient by a Gaussian's
-    2-D mean, summed over the views; the render itself cancels. The median is that of the Gaussians whose g is not 0.
+    2-D mean, summed over the views; the render itself cancels. The median is taken over the Gaussians whose g is not 0.
     """
     size = torch.zeros(len(work.gaussians))
     number = len(work.cameras)

@@ -67,7 +67,7 @@ class Queen(StreamingMethod[QueenState]):
         return QueenState(player, shown, self._weights(player, tools))
 
     def _weights(self, player: PlayerState, tools: Tools) -> dict[str, torch.Tensor]:
-        """Decoders as they were last sent, as they were first drawn where they never were."""
+        """Decoders as they were last sent; a decoder that was never sent is as it was drawn."""
         scene = player.gaussians.map(torch.from_numpy)
         policies = coded(self.config.latents(), scene)
         drawn = initial_weights(policies, scene, tools.rng)

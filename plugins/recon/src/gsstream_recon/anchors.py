@@ -61,7 +61,8 @@ def bound(centres: FloatArray, means: FloatArray, anchors: AnchorLevels) -> list
 def inherited(past: FloatArray, old: list[Level], new: list[Level], neighbours: int) -> list[FloatArray]:
     """Return the motions [K, 6] of the anchors on every level of ``new`` that give cells their past motion.
 
-    The coarsest level says the mean of its cells, each finer one the mean of what is left. An anchor that was drawn
+    The coarsest level stores the mean motion of its cells, each finer level the mean of what the coarser levels do not
+    explain. An anchor that was drawn
     anew takes the mean of the nearest old ones of its level, weighed by one over the distance.
     """
     motions, left = [], past

@@ -70,8 +70,9 @@ class AnchorMotion(MotionPart):
     """Moves small cells by anchors drawn among the Gaussians on several levels (ReCon-GS, NeurIPS 2025).
 
     Anchors are drawn anew every second frame and inherit what the old ones knew. What is sent is the rigid motion of
-    every cell, the sum of its anchors' motions. With ``rounded`` these are rounded while they are fitted, with the
-    gradient of what is not rounded (QuARC-GS, 2026). Defaults are the published values where a value is known; where
+    every cell, the sum of its anchors' motions. With ``rounded``, motions are rounded while they are fitted, and have
+    the gradient of motions that are not rounded (QuARC-GS, 2026). Defaults are the published values where a value is
+    known; where
     this differs, and why, is in the README of this plugin.
     """
 

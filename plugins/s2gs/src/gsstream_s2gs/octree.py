@@ -216,7 +216,8 @@ def _distance_range(xyz: torch.Tensor, centers: torch.Tensor, quantile: float) -
 
 
 def _cells(positions: torch.Tensor, origin: torch.Tensor, cell: float) -> torch.Tensor:
-    """[N, 3] int64 cell of each position. Limited to what the clamps of the callers tell apart, lest int64 overflow."""
+    """[N, 3] int64 cell of each position. Cells are limited to the range to which callers clamp them, so that int64
+    does not overflow."""
     limit = 4.0 * FAR_CELLS
     return torch.floor((positions - origin) / cell).clamp(-limit, limit).long()
 

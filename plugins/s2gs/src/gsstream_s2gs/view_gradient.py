@@ -177,7 +177,7 @@ class ViewSpaceGradient(ConfidenceEstimator):
         check_finite(f"screen gradient of view {view} at frame {context.index}", gradient)
         result = gradient.double()
         if self.config.units == "ndc":
-            # As numbers: a tensor of them would be copied to the device, which is waited for.
+            # Width and height are plain numbers: a tensor of them would be copied to the device, which takes a wait.
             across, down = result.unbind(1)
             result = torch.stack([across * (context.cameras.width / 2), down * (context.cameras.height / 2)], 1)
         return result

@@ -27,7 +27,7 @@ from gsstream_stream3dgs.cache import Cache, Lookup
 Setting = pydantic.Field
 #: Cells along an axis of a resolution of the grid, divided by those of the next coarser one.
 GROWTH = 2.0
-#: Least share of the views that show a Gaussian in which it must lie in changed tiles, to take part.
+#: A Gaussian takes part when it lies in changed tiles in at least this share of the views that show it.
 VOTES = 0.75
 #: Quantisation step of the network's weights.
 WEIGHT_STEP = 0.02

@@ -17,7 +17,7 @@ from gsstream_capture.board.adjust import Corners, Solution, adjust, adjust_twic
 from gsstream_capture.board.start import first_guess, first_lens, matrix, vector
 from gsstream_capture.board.takes import Takes
 
-#: Largest standard deviation of a focal length, as a share of it.
+#: Largest standard deviation of a focal length, as a share of the focal length.
 SURE = 0.01
 #: Every so many pictures of the rig take are kept out of the first adjustment, to be measured with.
 HELD = 5

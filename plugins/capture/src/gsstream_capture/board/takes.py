@@ -26,7 +26,7 @@ from gsstream.input.recordings.video import VideoClip
 from gsstream_capture.board.design import Board, Finder, Sighting, read_board
 
 BOARD_FILE, LENS, RIG = "board.yaml", "lens", "rig"
-#: Pictures of a take in which the board is looked for, evenly over it.
+#: Number of pictures, evenly over a take, in which the board is looked for.
 MOST = 240
 _VIDEOS, _PICTURES = (".mp4", ".mov", ".mkv", ".avi"), (".jpg", ".jpeg", ".png")
 _NUMBER = re.compile(r"(\d+)(?!.*\d)")

@@ -162,7 +162,7 @@ def _cases(plan: RenderPlan, scene: _Scene, name: str, part: Renderer, native: N
         whole = share >= 1
         mask = None if whole else scene.masks[share]
         if name == "reference" and not whole:
-            continue  # it knows no tiles: it would draw the whole image again
+            continue  # the reference knows no tiles: it would draw the whole image again
         for path in ("all rows",) if whole else ("all rows", "active rows"):
             active = None if path == "all rows" else scene.prints.in_tiles(scene.masks[share])
             if active is not None and not len(active):

@@ -1,8 +1,8 @@
 """Scenes for benchmarks: made from a seed; statistics like those of trained scenes.
 
 Like a trained scene: anisotropic with one thin axis, log-normal scales around the distance to the neighbours, a few
-large ones, opacities either faint or nearly opaque, rows in Morton order (memory order follows space). Not like one:
-orientations are random, so surfaces are rougher and a pixel needs more Gaussians to become opaque.
+large ones, opacities either faint or nearly opaque, rows in Morton order (memory order follows space). What differs
+from a real scene: orientations are random, so surfaces are rougher and a pixel needs more Gaussians to become opaque.
 """
 
 from __future__ import annotations

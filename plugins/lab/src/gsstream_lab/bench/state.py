@@ -12,7 +12,7 @@ from gsstream.engine.state.stream_state import StreamState
 
 
 def mid_stream_state(parts: Assembly, state: StreamState, last: EncodedFrame | None) -> StreamState:
-    """Return the state in the middle of a stream: with the caches that this variant's own step leaves behind.
+    """Return ``state`` in the middle of a stream: its session has the caches that a step of this variant fills.
 
     A step hands its session's caches on to the next scene, so each repetition needs them anew.
     """

@@ -45,7 +45,7 @@ def pareto_figure(groups: Sequence[Group], title: str) -> bytes:
 
     The front is a dark line with its knee in a ring; where recipes differ in one knob alone, a thin line joins those of
     one variant. Points far below the rest stand at the lower edge as triangles with their value. Names that would cover
-    one another are left out, those of the front last.
+    one another are left out; the names of points on the front are left out last.
     """
     costs = measured_costs(groups)
     goods = measured_goods(groups)

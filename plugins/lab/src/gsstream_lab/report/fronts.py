@@ -13,8 +13,8 @@ from gsstream_lab.report.groups import Group, is_tie, seed_noise
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     """Return the indices of (cost, good) points that no other beats in both, by rising cost.
 
-    A point is beaten by one that costs no more and is no worse, and differs from it. Of equal points the first counts;
-    points with nan are left out.
+    A point is beaten by one that costs no more and is no worse, and differs from it. Where points are equal, the first
+    counts; points with nan are left out.
     """
     known = [i for i, point in enumerate(points) if all(map(math.isfinite, point))]
     front: list[int] = []

@@ -49,7 +49,7 @@ class Outcome:
     id: str
     #: Per frame: what the run wrote down, and what was measured on the decoded frame.
     frames: tuple[Mapping[str, Any], ...] = ()
-    #: With every part's settings written out; ``recipe_hash`` of it.
+    #: The recipe with every part's settings written out, and its ``recipe_hash``.
     recipe: Mapping[str, Any] = field(default_factory=dict)
     recipe_hash: str = ""
     stream: bytes = b""  # the bytes of the stream

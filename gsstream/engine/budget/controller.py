@@ -103,7 +103,8 @@ def _phases(step: Step[Any], allowed: FrameBudget, log: FrameLog) -> dict[str, A
 def spent(plan: FrameBudget, used: Mapping[str, Any], stream: Stream, epochs: float) -> dict[str, Any]:
     """Return the entry ``budget`` of a frame, before its limits and the cost of the whole frame are added.
 
-    ``used`` is that of :meth:`EpochScheduler.usage`, with the seconds of parts that fit by themselves as ``parts``;
+    ``used`` is what :meth:`EpochScheduler.usage` returns, with the seconds of parts that fit by themselves as
+    ``parts``;
     ``stream`` holds the recipe's own settings, from which the plan departed.
     """
     reduced: dict[str, Any] = {}

@@ -173,7 +173,7 @@ class FirstFrameRun:
         #: [N] row of ``start`` that each Gaussian descends from.
         self.ancestors = torch.arange(len(start), device=self.device)
         self.order: list[int] = []
-        #: Mean loss of the last iterations, and the losses [] that are not in it yet.
+        #: Mean loss of the last iterations, and the losses, tensors [], that the mean does not contain yet.
         self.smooth = math.nan
         self.losses: list[torch.Tensor] = []
 

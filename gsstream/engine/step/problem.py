@@ -46,5 +46,5 @@ class Solution:
     iterations: int = 0  # views rendered
     #: Attribute -> [A, L], mean squared gradient of the latents: what a latent is worth, up to a factor.
     curvature: Mapping[str, torch.Tensor] = field(default_factory=dict)
-    dead_gates: int = 0  # gates of rows that stayed which ended where nothing moves them (:func:`count_dead_gates`)
+    dead_gates: int = 0  # gates, of rows that stayed, that neither images nor price can move (:func:`count_dead_gates`)
     open_gates: Sequence[int] = ()  # how many gates would have been sent open after each epoch

@@ -22,7 +22,7 @@ from gsstream.input.recordings.images import check_unpacked
 from gsstream.input.recordings.sync import RecordingWarning
 
 POINTS_FILE = "points_frame0.npz"
-#: Points that whoever made them trusts less than this, from 0 to 1, are left out.
+#: Points whose confidence, as their file states it, is below this (0 to 1) are left out.
 TRUSTED = 0.5
 #: Steps of float32 above this share of the points' spread move them visibly.
 COARSE = 1e-3

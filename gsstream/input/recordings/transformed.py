@@ -66,7 +66,7 @@ class TransformedSource(Wrapped):
             return image
 
         frame = assembled(self, index, split, read)
-        if bad and split == "test":  # nothing is measured against an image of another time
+        if bad and split == "test":  # no render is compared with an image of another time
             return replace(frame, cameras=frame.cameras.select([]), images=frame.images[:0])
         return replace(frame, epoch_scale=0.0) if bad and self._options.bad_image == "drop" else frame
 

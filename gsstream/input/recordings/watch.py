@@ -215,7 +215,7 @@ class WatchSource(CameraSource):
             if self._give_up(index, absent, whole, waited=now - came, over=over):
                 if absent == given_up:
                     return absent
-                given_up = absent  # and one more look: an image may have come during this one
+                given_up = absent  # the folder is looked at once more: an image may have come during the last look
                 continue
             if over or self._stop.is_set():
                 self._end(index, absent, ended)

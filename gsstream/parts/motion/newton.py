@@ -67,7 +67,7 @@ class DampedNewton:
         """Join groups to bodies (:func:`form_bodies`), which hold them in later steps; call it after the first epoch.
 
         The motions of groups in a body are smoothed. The steps of later views become long again: the groups have moved,
-        so what earlier views said of them was said of another place.
+        so the curvature of earlier views belongs to another place.
         """
         matrix = self._damped_curvature()
         bodies = form_bodies(

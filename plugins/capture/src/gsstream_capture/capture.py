@@ -21,7 +21,7 @@ from gsstream_capture.reader import CameraReader
 from gsstream_capture.report import Report
 from gsstream_capture.rig import Rig, opening_of, shown
 
-#: Seconds that the first whole instant may take, and without any picture after which a capture has ended.
+#: Seconds that the first whole instant may take; seconds without any picture after which a capture ends.
 BEGIN, TIMEOUT = 90.0, 30.0
 #: Seconds between two looks while nothing comes.
 LOOK = 0.1

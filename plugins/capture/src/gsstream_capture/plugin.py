@@ -33,7 +33,7 @@ def gsstream_commands() -> list[CommandSpec]:
         CommandSpec(
             name="calibrate",
             target="gsstream_capture.commands.calibrate:app",
-            summary="Find lenses and poses of a rig with a printed board, or of what it sees.",
+            summary="Find lenses and poses of a rig by pictures of a printed board, or of whatever the rig sees.",
             group=GROUP,
         ),
     ]

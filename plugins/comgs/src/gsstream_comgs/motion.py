@@ -30,7 +30,7 @@ CELL = 6.0
 def gradient_difference(work: FitContext) -> torch.Tensor:
     """Return [N]: how much the gradient by every Gaussian's 2-D mean changed since the frame before.
 
-    The gradient is the mean over the views of that of the squared error; the render itself cancels.
+    The gradient is the mean over the views of the gradient of the squared error; the render itself cancels.
     """
     total: torch.Tensor = torch.zeros(len(work.gaussians), 2)
     for view in range(len(work.cameras)):

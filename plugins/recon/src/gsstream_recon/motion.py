@@ -132,7 +132,7 @@ class AnchorMotion(MotionPart):
         return followed(anchors, before, delta)
 
     def _anchors(self, memory: AnchorLevels | None, frame: int, number: int, rng: Rng) -> AnchorLevels:
-        """Those of the frame before, or new ones when these are old or a level has none.
+        """The anchors of the frame before; new ones where those are too old, or where a level has none.
 
         Both ends could draw them: from the seed of the run and the number of the frame.
         """

@@ -12,7 +12,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, no_args_is_help=T
 
 @app.callback()
 def calibrate() -> None:
-    """Find lenses and poses of a rig with a printed board, or of what it sees."""
+    """Find lenses and poses of a rig by pictures of a printed board, or of whatever the rig sees."""
 
 
 @app.command("print")

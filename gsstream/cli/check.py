@@ -67,14 +67,14 @@ def _lines(subject: Subject, quiet: bool) -> Iterator[str]:
     if subject.absent:
         yield _line(subject.results[0], "every check")
         return
-    told = set()
+    reasons = set()
     for result in subject.results:
         reason = (result.status, result.message)
-        if reason in told or (quiet and result.status in ("passed", "skipped")):
+        if reason in reasons or (quiet and result.status in ("passed", "skipped")):
             continue
         same = [each for each in subject.results if (each.status, each.message) == reason]
         if result.status == "failed" and len(same) > 1:
-            told.add(reason)
+            reasons.add(reason)
             names = [each.check.removeprefix("check_") for each in same]
             yield _line(result, f"{len(same)} checks ({', '.join(names)})")
         else:

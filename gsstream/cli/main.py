@@ -96,11 +96,11 @@ def run_command(argv: Sequence[str]) -> int:
             typer.echo(f"error: {printable(cure)}", err=True)
             return 1
         except (OSError, MemoryError, RuntimeError) as error:
-            if options.debug or (told := describe(error)) is None:
+            if options.debug or (described := describe(error)) is None:
                 raise
             drop_output()
-            typer.echo(f"error: {printable(told[1])}", err=True)
-            return told[0]
+            typer.echo(f"error: {printable(described[1])}", err=True)
+            return described[0]
     if code == 130:
         return _interrupted()
     if code in _SIGNALS:

@@ -104,8 +104,10 @@ def read_ply(path: str | os.PathLike[str]) -> tuple[Gaussians[FloatArray], tuple
 def _bounded(path: str | os.PathLike[str], opacities: FloatArray) -> FloatArray:
     """Logits of opacity [N], those of exactly 1 and exactly 0 as near to them as any picture shows."""
     if number := int(np.isinf(opacities).sum()):
-        told = f"{path}: {number} opacities are infinite (opacity of exactly 1 or 0); they are read as {MOST_OPAQUE:g}"
-        warnings.warn(told, stacklevel=3)
+        message = (
+            f"{path}: {number} opacities are infinite (opacity of exactly 1 or 0); they are read as {MOST_OPAQUE:g}"
+        )
+        warnings.warn(message, stacklevel=3)
     return np.where(np.isinf(opacities), np.copysign(np.float32(MOST_OPAQUE), opacities), opacities)
 
 

@@ -68,14 +68,14 @@ class Hub:
 
     async def _send(self, socket: WebSocket, cursor: Cursor) -> None:
         """Send packets and states for ever. The connection holds at most one packet that the viewer has not taken."""
-        stream, told, damage, generation = self.follower, None, None, None
+        stream, sent_state, damage, generation = self.follower, None, None, None
         while True:
             news, entry = self._news, cursor.next()
             # While packets remain for this viewer, its state is "live", also when the encoder has ended meanwhile.
             damage = damage if entry is None else None
             state = damage or (self.state if entry is None else State("live"))
-            if state != told:
-                told = state
+            if state != sent_state:
+                sent_state = state
                 await _tell(socket, state=state.name, detail=state.detail, newest=stream.newest)
             if entry is None:
                 await news.wait()

@@ -87,16 +87,16 @@ def changes_of(cameras: Sequence[RawCamera], resampled: Sequence[bool], target: 
 
     A rig has one size, for renderers draw all cameras of a batch at once: the smallest camera decides.
     """
-    told = []
+    messages = []
     if len({camera.size for camera in cameras}) > 1:
         sizes = ", ".join(f"{c.name} {c.size[0]} x {c.size[1]}" for c in cameras if c.size != target)
         least = [min(camera.size[axis] for camera in cameras) for axis in (0, 1)]
         small = " ".join(f"--without {c.name}" for c in cameras if c.size[0] == least[0] or c.size[1] == least[1])
-        told.append(
+        messages.append(
             f"warning: all pictures become {target[0]} x {target[1]} pixels, since a rig has one size; shrunk or cut "
             f"are {sizes}; to keep more pixels, leave out the smallest: {small}"
         )
     deep = [c.name for c, made in zip(cameras, resampled, strict=True) if c.clip.deep and (made or not c.files)]
     if deep:
-        told.append(f"pictures of {', '.join(deep)} have more than 8 bits per channel; they are written with 8")
-    return told
+        messages.append(f"pictures of {', '.join(deep)} have more than 8 bits per channel; they are written with 8")
+    return messages

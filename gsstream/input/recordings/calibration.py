@@ -118,8 +118,8 @@ def _parse_json(path: Path, absent: str = "") -> Any:
     except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, numbers of thousands of digits, deep nesting
         raise SourceError(f"{path}: not valid JSON: {error}") from error
     except OSError as error:
-        told = absent if absent and isinstance(error, FileNotFoundError) else f"cannot be read: {error}"
-        raise SourceError(f"{path}: {told}") from error
+        message = absent if absent and isinstance(error, FileNotFoundError) else f"cannot be read: {error}"
+        raise SourceError(f"{path}: {message}") from error
 
 
 def _check_weight(path: Path, data: bytes) -> None:

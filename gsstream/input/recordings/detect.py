@@ -43,8 +43,8 @@ def detect(folder: Path) -> str:
     if len(found) == 1:
         return found[0]
     if found:
-        told = "; ".join(f"{name} ({LAYOUTS[name][1]})" for name in found)
-        raise SourceError(f"{folder}: the files fit several layouts: {told}. Say which: --source {found[0]}:{folder}")
+        listed = "; ".join(f"{name} ({LAYOUTS[name][1]})" for name in found)
+        raise SourceError(f"{folder}: the files fit several layouts: {listed}. Say which: --source {found[0]}:{folder}")
     known = "; ".join(f"{name}: {looks}" for name, (_, looks) in LAYOUTS.items())
     raise SourceError(
         f"{folder}: no known layout. Expected one of these: {known}. Videos or images without a "

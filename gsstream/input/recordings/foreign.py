@@ -52,8 +52,8 @@ def check_keys(where: str, found: Iterable[Mapping[str, Any]], known: Keys) -> N
         for key, value in entry.items():
             if bad(key):
                 if _says(value):
-                    told = f"{where}: {key!r} is not supported, and says how to read the file, got {brief(value)}"
-                    raise SourceError(f"{told}: export without this key, or undistort the pictures")
+                    text = f"{where}: {key!r} is not supported, and says how to read the file, got {brief(value)}"
+                    raise SourceError(f"{text}: export without this key, or undistort the pictures")
             elif not fine(key):
                 if near := spelled.get(_bare(key)):
                     raise SourceError(f"{where}: the key {key!r} is not known; did you mean {near!r}?")
@@ -61,9 +61,9 @@ def check_keys(where: str, found: Iterable[Mapping[str, Any]], known: Keys) -> N
     if unknown:
         names = [key.rstrip("*") for key in (*read, *idle)]
         near = suggest(next(iter(unknown)), names) if len(unknown) == 1 else ""
-        told = ", ".join(f"{key!r}" for key in list(unknown)[:8]) + (", ..." if len(unknown) > 8 else "")
+        listed = ", ".join(f"{key!r}" for key in list(unknown)[:8]) + (", ..." if len(unknown) > 8 else "")
         near = near if "did you mean" in near else ""
-        warn(f"{where}: keys that are not known have no effect: {told}{near}")
+        warn(f"{where}: keys that are not known have no effect: {listed}{near}")
 
 
 def _test(names: Sequence[str]) -> Callable[[str], bool]:
@@ -87,9 +87,9 @@ def _says(value: Any) -> bool:
         return str(value).lower() not in ("", "none", "null", "false")
 
 
-def warn(told: str) -> None:
+def warn(text: str) -> None:
     """Warn of something in a recording that deserves a look."""
-    warnings.warn(told, RecordingWarning, stacklevel=3)
+    warnings.warn(text, RecordingWarning, stacklevel=3)
 
 
 @contextmanager
@@ -109,10 +109,10 @@ def left_out(where: str, why: str, names: Sequence[str], stay: int, *, what: str
     """Warn of cameras that are only half there, with those that stay. Raises SourceError where none stay."""
     if not names:
         return
-    told = f"{where}: {what} {why} are left out: {', '.join(names)}; {stay} of {stay + len(names)} stay"
+    text = f"{where}: {what} {why} are left out: {', '.join(names)}; {stay} of {stay + len(names)} stay"
     if not stay:
-        raise SourceError(f"{told}: restore what is missing")
-    warn(told)
+        raise SourceError(f"{text}: restore what is missing")
+    warn(text)
 
 
 def number(
@@ -136,13 +136,13 @@ def pixels(where: str, key: str, value: Any) -> int:
 
 def matrix(where: str, key: str, value: Any, *shapes: tuple[int, ...]) -> FloatArray:
     """Return finite numbers of one of these shapes, float64. Raises SourceError for anything else, texts included."""
-    told = f"{where}: {key} must be {' or '.join(' x '.join(map(str, shape)) for shape in shapes)} finite numbers"
+    text = f"{where}: {key} must be {' or '.join(' x '.join(map(str, shape)) for shape in shapes)} finite numbers"
     try:
         cells = np.array(value, dtype=object)
     except ValueError as error:
-        raise SourceError(f"{told}, got lists of different lengths") from error
+        raise SourceError(f"{text}, got lists of different lengths") from error
     if cells.shape not in shapes:
-        raise SourceError(f"{told}, got {list(cells.shape) if cells.shape else brief(value)}")
+        raise SourceError(f"{text}, got {list(cells.shape) if cells.shape else brief(value)}")
     for cell in cells.flat:
         number(where, f"{key}: every element", cell)
     return cells.astype(np.float64)

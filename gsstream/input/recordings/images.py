@@ -101,11 +101,11 @@ def _average(lines: np.ndarray[Any, Any], target: int) -> FloatArray:
     return means
 
 
-def check_unpacked(path: Path, size: int, told: str) -> None:
+def check_unpacked(path: Path, size: int, message: str) -> None:
     """Raise SourceError for a file that unpacks to far more bytes than it has: ask before unpacking it."""
     packed = path.stat().st_size
     if size > max(_UNPACKED, _PACKED * packed):
-        raise SourceError(f"{path}: {packed} bytes unpack to {size}, more than {_PACKED} times as many: {told}")
+        raise SourceError(f"{path}: {packed} bytes unpack to {size}, more than {_PACKED} times as many: {message}")
 
 
 def check_photograph(path: Path, image: Image.Image) -> None:

@@ -121,8 +121,8 @@ def read_ply_points(path: Path) -> PointCloud:
     channels = next((known for known in (*_CHANNELS, _SPHERICAL) if set(known) <= set(names)), None)
     if channels is None:
         if others := [name for name in names if name not in ("x", "y", "z", "nx", "ny", "nz")]:
-            told = f"{path}: no colours among the vertex properties {', '.join(others[:12])}; the points are grey"
-            warnings.warn(told, RecordingWarning, stacklevel=2)
+            message = f"{path}: no colours among the vertex properties {', '.join(others[:12])}; the points are grey"
+            warnings.warn(message, RecordingWarning, stacklevel=2)
         return PointCloud(xyz, np.full(xyz.shape, 0.5, np.float32), path.name)
     values = np.stack([table[names[channel]] for channel in channels], 1)
     if channels is _SPHERICAL:

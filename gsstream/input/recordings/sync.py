@@ -96,7 +96,9 @@ def _lengths(clips: Mapping[str, Clip], shared: Sequence[int]) -> list[str]:
     start, last, spans = shared[0], shared[-1], [(clip.numbers[0], clip.numbers[-1]) for clip in clips.values()]
     if len(set(spans)) == 1:
         return []
-    told = ", ".join(f"{i} {c.num_frames} from {c.numbers[0]}" for i, c in clips.items() if c.num_frames != len(shared))
+    listed = ", ".join(
+        f"{i} {c.num_frames} from {c.numbers[0]}" for i, c in clips.items() if c.num_frames != len(shared)
+    )
     limits = [
         i
         for i, (first, end) in zip(clips, spans, strict=True)
@@ -104,7 +106,7 @@ def _lengths(clips: Mapping[str, Clip], shared: Sequence[int]) -> list[str]:
         or (end == last and any(other > last for _, other in spans))
     ]
     return [
-        f"cameras differ in their frames ({told}); the {len(shared)} common ones are used, from number {start}; the "
+        f"cameras differ in their frames ({listed}); the {len(shared)} common ones are used, from number {start}; the "
         f"span is that of {', '.join(limits)}"
     ]
 

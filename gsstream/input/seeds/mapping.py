@@ -84,10 +84,10 @@ def reconstruct(
 
 def _apart(pairs: IntArray, counts: IntArray, names: Sequence[str]) -> str:
     most = np.argsort(-counts, kind="stable")[:10]
-    told = ", ".join(" and ".join(names[i] if names else str(i) for i in pairs[k]) + f" {counts[k]}" for k in most)
+    listed = ", ".join(" and ".join(names[i] if names else str(i) for i in pairs[k]) + f" {counts[k]}" for k in most)
     more = f", and {len(counts) - len(most)} pairs with no more" if len(counts) > len(most) else ""
     return (
-        f"structure from motion: no two pictures share enough features to begin with (matches: {told}{more}); give "
+        f"structure from motion: no two pictures share enough features to begin with (matches: {listed}{more}); give "
         "poses instead: calibrate the cameras with a board and put the calibration beside the pictures "
         f"({page('howto/prepare.md')})"
     )

@@ -39,8 +39,8 @@ def read(folder: Path) -> Recording:
     if not rigs:
         raise SourceError(f"{folder}: no calibration of two cameras or more, here or in calibration/")
     if len(rigs) > 1:
-        told = ", ".join(str(files[0][0]) for files in rigs)
-        raise SourceError(f"{folder}: several calibrations: {told}; leave one of them there")
+        listed = ", ".join(str(files[0][0]) for files in rigs)
+        raise SourceError(f"{folder}: several calibrations: {listed}; leave one of them there")
     path, first = rigs[0][0]
     # A file with a whole rig stands for itself; files of one camera each belong together.
     cameras = first if len(first) > 1 else [camera for _, found in rigs[0] for camera in found]

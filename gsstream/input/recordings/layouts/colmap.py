@@ -79,8 +79,10 @@ def _largest(folder: Path) -> tuple[Path, dict[int, ModelImage]]:
     if not models[best]:
         raise SourceError(f"{best}: the model has no registered images")
     if len(models) > 1:
-        told = ", ".join(f"{place.relative_to(folder)} has {len(images)} images" for place, images in models.items())
-        warn(f"{folder}: several models: {told}; {best.relative_to(folder)} is read: delete the others, or merge them")
+        listed = ", ".join(f"{place.relative_to(folder)} has {len(images)} images" for place, images in models.items())
+        warn(
+            f"{folder}: several models: {listed}; {best.relative_to(folder)} is read: delete the others, or merge them"
+        )
     return best, models[best]
 
 

@@ -146,14 +146,14 @@ def _present(
     blind = [entry for entry in frames if not files[entry["file_path"]].exists()]
     lost = [entry for entry in frames if "transform_matrix" not in entry]
     kept = [entry for entry in frames if "transform_matrix" in entry and files[entry["file_path"]].exists()]
-    for bad, told in ((blind, "pictures are missing"), (lost, "entries have no transform_matrix")):
+    for bad, why in ((blind, "pictures are missing"), (lost, "entries have no transform_matrix")):
         if not bad:
             continue
-        told = f"{path}: {len(bad)} of {len(frames)} {told}, the first is {bad[0]['file_path']}"
+        message = f"{path}: {len(bad)} of {len(frames)} {why}, the first is {bad[0]['file_path']}"
         if not kept or missing == "refuse":
-            raise SourceError(f"{told}; restore them, or take them out of the file")
+            raise SourceError(f"{message}; restore them, or take them out of the file")
         warn(
-            f"{told}; they are skipped, as nerfstudio does, and {len(kept)} stay. To refuse them: --source "
+            f"{message}; they are skipped, as nerfstudio does, and {len(kept)} stay. To refuse them: --source "
             f"'nerfstudio:{path.parent}?missing=refuse'"
         )
     return kept

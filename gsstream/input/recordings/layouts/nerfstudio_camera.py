@@ -73,8 +73,8 @@ def _focal(where: str, data: dict[str, Any], *, axis: str, side: int, name: str)
         return number(where, f"{key} of camera {name!r}", data[key], above=0)
     for key, full in ((f"camera_angle_{axis}", math.pi), (f"{axis}_fov", 180.0)):
         if key in data:
-            told = f"an angle between 0 and {full:.5g}"
-            angle = number(where, f"{key} of camera {name!r}", data[key], above=0, below=full, expected=told)
+            message = f"an angle between 0 and {full:.5g}"
+            angle = number(where, f"{key} of camera {name!r}", data[key], above=0, below=full, expected=message)
             return 0.5 * side / math.tan(0.5 * math.pi * angle / full)
     return None
 

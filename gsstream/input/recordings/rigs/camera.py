@@ -122,8 +122,8 @@ def opencv_lens(values: Sequence[float], fisheye: bool, where: str) -> Lens:
     if fisheye and len(values) == 4:
         return Lens("fisheye", tuple(values))
     if fisheye or (any(values) and (len(values) not in (4, 5, 8, 12, 14) or any(values[12:]))):
-        told = "0, 4, 5, 8 or 12 coefficients (k1, k2, p1, p2, k3 to k6, s1 to s4)"
-        kind = "4 coefficients of a fisheye" if fisheye else told
+        counts = "0, 4, 5, 8 or 12 coefficients (k1, k2, p1, p2, k3 to k6, s1 to s4)"
+        kind = "4 coefficients of a fisheye" if fisheye else counts
         raise SourceError(f"{where}: expected {kind}, got {list(values)}")
     k1, k2, p1, p2, *more = (*values, 0.0, 0.0, 0.0, 0.0)[: max(4, len(values))]
     s1, s2, s3, s4 = more[4:8] if len(values) >= 12 else (0.0,) * 4

@@ -26,7 +26,7 @@ BEGIN, TIMEOUT = 90.0, 30.0
 #: Seconds between two looks while nothing comes.
 LOOK = 0.1
 Say = Callable[[str], None]
-Look = Callable[[int, Any], None]
+OnPicture = Callable[[int, Any], None]
 
 
 class LiveRig:
@@ -88,8 +88,8 @@ class LiveRig:
             if all(reader.health.state == "ended" for reader in self.readers):
                 break
         lacking = [f"{r.spec.id!r} ({shown(r.spec.url)}): {_state(r)}" for r in self.readers if _lacks(r)]
-        told = "; ".join(lacking) or "all send, but never within half a frame of each other for two seconds"
-        raise SourceError(f"no first instant of all cameras within {seconds:.0f} s; {told}")
+        reason = "; ".join(lacking) or "all send, but never within half a frame of each other for two seconds"
+        raise SourceError(f"no first instant of all cameras within {seconds:.0f} s; {reason}")
 
     @property
     def heard(self) -> float:
@@ -149,7 +149,7 @@ def run_capture(
     say: Say,
     stopped: threading.Event,
     raw: bool = False,
-    look: Look | None = None,
+    look: OnPicture | None = None,
 ) -> Report:
     """Capture until ``seconds`` have passed, ``stopped`` is set, or all cameras are silent; END is written then.
 
@@ -200,7 +200,7 @@ CLOCKS = {
 class _Until:
     seconds: float | None
     stopped: threading.Event
-    look: Look | None = None
+    look: OnPicture | None = None
     began: float = field(default_factory=time.monotonic)
 
     def over(self) -> bool:
@@ -239,7 +239,7 @@ def _write(
     report: Report,
     *,
     instant: Instant,
-    look: Look | None,
+    look: OnPicture | None,
 ) -> bool:
     """Write one instant, or count it where the disk is nearly full; False: there is no room for anything."""
     free = writer.free if writer.frames % 10 == 0 or report.disk else LOW

@@ -97,17 +97,17 @@ def _table(readers: list[CameraReader], offsets: Any) -> list[str]:
     for reader in readers:
         health, size = reader.health, reader.health.size or (0, 0)
         off: Offset | None = offsets.get(reader.number)
-        told = f"{reader.spec.id}: {size[0]} x {size[1]}, {health.fps:.1f}/s, paired by {CLOCKS[health.clock]}"
+        line = f"{reader.spec.id}: {size[0]} x {size[1]}, {health.fps:.1f}/s, paired by {CLOCKS[health.clock]}"
         if off is not None:
-            told += f", {1000 * off.median:+.1f} ms from the rig (spread {1000 * off.spread:.1f})"
+            line += f", {1000 * off.median:+.1f} ms from the rig (spread {1000 * off.spread:.1f})"
         if health.ways:
-            told += f", {1000 * median(health.ways):.0f} ms on its way"
+            line += f", {1000 * median(health.ways):.0f} ms on its way"
         keys = np.diff(health.keys)
         if len(keys) and (gap := float(np.median(keys))) > KEYS:
-            told += f"; sends a key picture every {gap:.1f} s: set its GOP to 1 s"
+            line += f"; sends a key picture every {gap:.1f} s: set its GOP to 1 s"
         if health.damaged:
-            told += f"; {health.damaged} pictures were damaged"
-        lines.append(told)
+            line += f"; {health.damaged} pictures were damaged"
+        lines.append(line)
     return lines
 
 
@@ -123,8 +123,8 @@ def _exposure(found: Any, plans: list[CameraPlan]) -> list[str]:
         if np.isnan(gain).any():
             lines.append(f"exposure of {plan.name}: not known (too few points that others see, too)")
         elif np.abs(gain - 1).max() > EXPOSURE:
-            told = ", ".join(
+            listed = ", ".join(
                 f"{name} {100 * (g - 1):+.0f} %" for name, g in zip(("blue", "green", "red"), gain, strict=True)
             )
-            lines.append(f"exposure of {plan.name}: {told}; set exposure and white balance to manual")
+            lines.append(f"exposure of {plan.name}: {listed}; set exposure and white balance to manual")
     return lines or ["exposures agree within 3 %"]

@@ -53,7 +53,7 @@ class FolderWriter:
         """Bytes that the disk has left."""
         return shutil.disk_usage(self._out).free
 
-    def add(self, pictures: Mapping[int, bytes], told: Mapping[str, Any]) -> None:
+    def add(self, pictures: Mapping[int, bytes], facts: Mapping[str, Any]) -> None:
         """Write one instant: files by camera, and its line of the log.
 
         They get their names when all are written: who follows takes a camera that is behind the others for gone.
@@ -64,7 +64,7 @@ class FolderWriter:
         parts = [self._part(path, data) for path, data in paths.items()]
         for part, path in zip(parts, paths, strict=True):
             self._named(part, path)
-        self._log.write(json.dumps({"frame": self.frames, **told}) + "\n")
+        self._log.write(json.dumps({"frame": self.frames, **facts}) + "\n")
         self._log.flush()
         self.frames += 1
 

@@ -77,8 +77,8 @@ class RigSource(Wrapped):
 
     def _said(self) -> str:
         assert self._process.stderr is not None, "it has a pipe"
-        told = self._process.stderr.read().strip().splitlines()
-        return told[-1].removeprefix("error: ") if told else f"the capture ended with {self._process.returncode}"
+        lines = self._process.stderr.read().strip().splitlines()
+        return lines[-1].removeprefix("error: ") if lines else f"the capture ended with {self._process.returncode}"
 
     def close(self) -> None:
         """End the capture and all waits."""

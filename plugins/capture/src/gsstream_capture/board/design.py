@@ -125,6 +125,8 @@ def page(board: Board) -> Any:
         high = DOTS * (8 if millimetre % 10 == 0 else 5 if millimetre % 5 == 0 else 3)
         x = margin + millimetre * DOTS
         draw.line([(x, top), (x, top + high)], fill=0, width=2)
-    told = f"100 mm. Print at 100 %, glue it on something flat, measure a square: {board.square_mm:g} mm in board.yaml"
-    draw.text((margin, top + 10 * DOTS), told, fill=0, font_size=4 * DOTS)
+    message = (
+        f"100 mm. Print at 100 %, glue it on something flat, measure a square: {board.square_mm:g} mm in board.yaml"
+    )
+    draw.text((margin, top + 10 * DOTS), message, fill=0, font_size=4 * DOTS)
     return sheet

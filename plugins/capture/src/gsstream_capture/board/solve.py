@@ -52,9 +52,9 @@ def solve(takes: Takes) -> Calibrated:
     found = solved(takes)
     unsure = [c for c in range(len(found.names)) if not found.deviation[c] <= SURE]
     if unsure:
-        told = ", ".join(f"{found.names[c]!r} {100 * found.deviation[c]:.1f} %" for c in unsure)
+        listed = ", ".join(f"{found.names[c]!r} {100 * found.deviation[c]:.1f} %" for c in unsure)
         raise SourceError(
-            f"the focal length is not sure to {100 * SURE:.0f} %: {told}; take more pictures of the board close to "
+            f"the focal length is not sure to {100 * SURE:.0f} %: {listed}; take more pictures of the board close to "
             "these cameras, tilted, and in all corners of their pictures"
         )
     return found

@@ -155,7 +155,7 @@ def fit_transforms_newton(
         return work.loss_and_grad(view, wrt, "changed")
 
     begin = torch.cat([local.translation, local.rotation], 1) / per_step
-    if float(begin.abs().max()) > FAR:
+    if max(np.abs(start.translation).max() / unit[0], np.abs(start.rotation).max() / unit[3]) > FAR:
         begin = begin * share_of_prediction(begin, compared, range(0, views, -(-views // LOOKS)))
     descent = DampedNewton(begin, damping)
     for step in range(iterations):
@@ -184,7 +184,7 @@ def share_of_prediction(
     """
     best, least = 1.0, math.inf
     for share in (1.0, 0.0, -1.0):
-        if (loss := sum(float(compared(share * predicted, view).loss) for view in views)) >= least:
+        if (loss := float(sum(compared(share * predicted, view).loss for view in views))) >= least:
             break  # the farther from it, the worse
         best, least = share, loss
     return best

@@ -38,7 +38,8 @@ def test_an_orbit_stays_where_cameras_are(first, turn) -> None:
     assert np.abs(off).max() <= 0.6 + OUT_OF_ARC
     assert off.min() < -0.55, "both ends are visited"
     assert off.max() > 0.55
-    assert path.centers[0] == pytest.approx(rig.centers[0], abs=1e-6), "it begins at the first camera"
+    # The point it turns around is drawn a little towards the cameras, here by a tenth of a thousandth of its distance.
+    assert path.centers[0] == pytest.approx(rig.centers[0], abs=1e-3), "it begins at the first camera"
     assert np.abs(np.diff(off, append=off[0])).max() < 0.12, "no jump, also from the last picture to the first"
 
 

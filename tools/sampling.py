@@ -105,7 +105,7 @@ def grown(samples: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
     The first fifth holds the first frame and its refinement, so the first of the five numbers is at its end.
     """
-    full = [sample for sample in samples if sample["run"] and sample["frames"]]
+    full = [sample for sample in samples if sample["run"] and sample["frames"]]  # none of a run of some seconds
     out: dict[str, Any] = {}
     for process in ("run", "capture"):
         seen = [sample[process] for sample in full if sample[process]]
@@ -113,7 +113,7 @@ def grown(samples: Sequence[dict[str, Any]]) -> dict[str, Any]:
             values = [facts[key] for facts in seen]
             out[f"{process}_{key}"] = [values[int(share * (len(values) - 1) / 5)] for share in range(1, 6)]
             out[f"{process}_most_{key}"] = max(values)
-    return out | {"files_of_the_run": max(sample["files_of_the_run"] for sample in full)}
+    return out | {"files_of_the_run": max((sample["files_of_the_run"] for sample in full), default=0)}
 
 
 def decoded_frames(stream: Path) -> tuple[list[int], dict[str, int]]:

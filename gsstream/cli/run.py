@@ -123,15 +123,20 @@ def _reused_lines(
 def meant_for(uri: str) -> str | None:
     """Return the name of the recipe that is meant for a recording, by its layout; None where there is none.
 
-    ``uri``: address of a recording that can be opened. Raises SourceError for a folder whose layout is not known.
+    ``uri``: address of a recording that can be opened.
     """
     from gsstream.input.recordings.detect import LAYOUTS, detect
     from gsstream.recipe.shipped import OF_LAYOUT
 
     layout, colon, _ = uri.partition(":")
-    if not (colon and layout in LAYOUTS):
-        layout = detect(Path(uri)) if uri != "demo" and Path(uri).is_dir() else ""
-    return OF_LAYOUT.get(layout)
+    if colon and layout in LAYOUTS:
+        return OF_LAYOUT.get(layout)
+    if uri == "demo" or not Path(uri).is_dir():
+        return None
+    try:
+        return OF_LAYOUT.get(detect(Path(uri)))
+    except SourceError:  # a folder of no layout, which has the name of another source by chance
+        return None
 
 
 def _proposed(source: str, given: Sequence[Path]) -> str:

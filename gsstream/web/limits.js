@@ -21,16 +21,10 @@ export const MAX_BITS = 20;
 export const ATTRIBUTES = ["means", "quats", "scales", "opacities", "sh0", "shN"];
 export const WIDTHS = { means: [3], quats: [4], scales: [3], opacities: [1], sh0: [3], shN: [0, 9, 24, 45] };
 
-/** A limit of this reader (section 1.8): bytes that a stream may take, and more for each of its own bytes. */
-const FREE_MEMORY = 200e6;
-const MEMORY_PER_BYTE = 1000;
-/** What a number of a Gaussian takes while it is decoded. */
-const PER_NUMBER = 12;
-
-/** Refuse Gaussians that take far more memory than the `bytes` of the stream up to there can honestly hold. */
+/** Refuse Gaussians that take more than 200 MB and 1,000 bytes for each of the stream's `bytes` so far (section 1.8). */
 export function checkMemory(rows, numbers, bytes) {
-  const wanted = PER_NUMBER * rows * numbers;
-  if (wanted > FREE_MEMORY + MEMORY_PER_BYTE * bytes) {
+  const wanted = 12 * rows * numbers; // of each number while it is decoded
+  if (wanted > 2e8 + 1000 * bytes) {
     throw new PacketError(
       `${rows} Gaussians take ${Math.round(wanted / 1e6)} MB, more than a stream of ${bytes} bytes is trusted with`,
     );

@@ -160,5 +160,5 @@ def test_export_and_manifest_commands(tmp_path, capsys):
     assert run_command(["export", str(path), "--format", "manifest", "--out", str(tmp_path / "m")]) == 0
     assert len(json.loads((tmp_path / "m" / "stream.json").read_text())["packets"]) == 5
     capsys.readouterr()
-    assert run_command(["export", str(path), "--format", "glb", "--out", str(tmp_path / "no")]) == 2
-    assert "'glb' is not one of 'ply', 'spz', 'sequence'" in capsys.readouterr().err
+    assert run_command(["export", str(path), "--format", "obj", "--out", str(tmp_path / "no")]) == 2
+    assert "'obj' is not one of 'ply', 'spz', 'glb', 'sequence', 'usd', '4dgs'" in capsys.readouterr().err

@@ -203,12 +203,13 @@ def test_the_player_hears_of_parts_what_it_hears_of_a_socket(packets, tmp_path: 
     const heard = [], states = [];
     const digest = async (data) => Buffer.from(await crypto.subtle.digest("SHA-256", data)).toString("hex");
     await new Promise((done) => {
-      const link = new LiveParts({ opened() {}, trouble: (text) => states.push(text), message(data) {
-        if (data instanceof ArrayBuffer) heard.push(data);
-        else states.push(data.state);
-        if (data.state === "ended") done();
-      } }, given);
-      link.start();
+      const buffer = { url: given, opened() {}, trouble: (text) => states.push(text) };
+      buffer.came = (data) => heard.push(data);
+      buffer.said = ({ state }) => {
+        states.push(state);
+        if (state === "ended") done();
+      };
+      new LiveParts(buffer).start();
     });
     return { heard: await Promise.all(heard.map(digest)), states: [...new Set(states)] };
     """

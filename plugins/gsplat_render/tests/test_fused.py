@@ -16,7 +16,7 @@ from torch_kernels import TORCH_FUSED
 
 from gsstream.parts.backend.reference import ReferenceRenderer
 from gsstream.parts.render.loss import ReferenceLoss
-from gsstream.testing import loss as loss_checks
+from gsstream.testing import loss_and_change as loss_checks
 from gsstream.testing import optimiser as optimiser_checks
 
 pytest.importorskip("triton", reason="needs the package triton, which torch's CUDA builds bring")

@@ -97,7 +97,7 @@ export function parsePacket(data, offset) {
   return { header, sections: splitSections(header.sections, body, offset + PACKET_HEADER) };
 }
 
-/** The numbers of the sections of a packet, as far as they can be told before it is checked. */
+/** The numbers of a packet's sections, before it is checked. */
 export function* sectionsOf(data) {
   const view = viewOf(data);
   for (let at = PACKET_HEADER; at + SECTION_HEADER <= data.length; at += SECTION_HEADER + view.getUint32(at + 1, true)) {

@@ -25,8 +25,7 @@ export const WIDTHS = { means: [3], quats: [4], scales: [3], opacities: [1], sh0
 export function checkMemory(rows, numbers, bytes) {
   const wanted = 12 * rows * numbers; // of each number while it is decoded
   if (wanted > 2e8 + 1000 * bytes) {
-    throw new PacketError(
-      `${rows} Gaussians take ${Math.round(wanted / 1e6)} MB, more than a stream of ${bytes} bytes is trusted with`,
-    );
+    const size = Math.round(wanted / 1e6);
+    throw new PacketError(`${rows} Gaussians take ${size} MB, more than a stream of ${bytes} bytes is trusted with`);
   }
 }

@@ -3,6 +3,7 @@
 import "./changes/field.js";
 import { FILE_HEADER, KIND, PACKET_HEADER, checkFileHeader, parseHeader } from "./container.js";
 import { PacketError } from "./errors.js";
+import { LiveParts } from "./live-parts.js";
 import { LiveSocket } from "./live-socket.js";
 
 /** Milliseconds of decoding after which what there is is shown, although more has come. */
@@ -12,14 +13,14 @@ export const settings = { quiet: 10_000 };
 
 /** Stands where a recording has its buffer (see buffer.js); the stream calls `feed` when the page can show more. */
 export class LiveBuffer {
-  constructor(url, stream, Link = LiveSocket) {
+  constructor(url, stream, parts) {
     Object.assign(this, { url, stream, live: true, fps: 30, received: 0, first: null, last: null, lastLoaded: null });
     Object.assign(this, { queue: [], waiting: 0, gaps: [], told: "" });
     /** Bytes that may wait to be decoded. A page that is not shown takes no more and catches up later. */
     this.most = 16 * 2 ** 20;
     this.state = { name: "live", detail: "" };
     this.cut = this.broken = this.joined = this.before = null;
-    this.socket = new Link(this);
+    this.socket = parts ? new LiveParts(this) : new LiveSocket(this);
     this.clock = setInterval(() => this._tell(), 500);
     this.socket.start();
   }
@@ -93,6 +94,7 @@ export class LiveBuffer {
   /** Where to connect. Whoever comes again says what it has, and gets only what follows that. */
   address() {
     const url = new URL(this.url);
+    if (/^https?:$/.test(url.protocol)) url.protocol = url.protocol === "https:" ? "wss:" : "ws:";
     if (this.before && !this.broken) {
       url.searchParams.set("after", this.before.frame);
       url.searchParams.set("packet", this.before.head);

@@ -5,17 +5,14 @@ import { SourceError, bytesOf, fileOf } from "./download.js";
 import { FORMAT_MAJOR, FORMAT_MINOR } from "./limits.js";
 import { PacketWalker } from "./walker.js";
 
-/** The numbers of two sections. */
-const [FIELD, LAYERS] = [10, 11];
-
 /**
  * Find out what is at `url`: `{ segments, frames, fps, renditions }`.
  *
  * A segment is `{ first, last, url, start, end, whole }`: a key packet and what follows, bytes `start` to `end` of a
  * file, or the whole file. `last` and `frames` are null where only playing tells. Where a segment can be joined in its
- * middle, each piece is an entry of its own: those behind the first have `join`, the state they begin with, and `key`,
- * the key packet that it refers to; `all` says where their file ends. Of a live stream
- * there are no segments but `follow(stream)`, which returns its buffer. Throws SourceError or PacketError.
+ * middle, each piece is an entry: those behind the first have `join`, the state they begin with, and `key`,
+ * the key packet that it refers to; `all` says where their file ends. A live stream has only `follow(stream)`, which
+ * returns its buffer. Throws SourceError or PacketError.
  */
 export async function openSource(url, signal) {
   const address = new URL(url);
@@ -41,7 +38,7 @@ async function openManifest(url, signal) {
     );
   }
   if (typeof manifest?.live === "string") return liveSource(beside(manifest.live, url));
-  if (Array.isArray(manifest?.parts)) return liveSource(new URL(url), (await import("./live-parts.js")).LiveParts);
+  if (manifest?.parts) return liveSource(new URL(url), true);
   const renditions = [manifest, ...(manifest.renditions ?? [])].map((entry, i) => ({
     name: entry.name ?? (i ? `rendition ${i}` : "full"),
     gaussians: entry.gaussians ?? null,
@@ -53,11 +50,10 @@ async function openManifest(url, signal) {
   return { segments, frames: last - segments[0].first + 1, fps: manifest.fps ?? null, renditions, poster };
 }
 
-/** A stream as it is written, from its socket or by another `Link`. Only who looks at one loads what it takes. */
-async function liveSource(address, Link) {
-  if (!Link && /^https?:$/.test(address.protocol)) address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
+/** A stream as it is written, from its socket or in parts. */
+async function liveSource(address, parts) {
   const { LiveBuffer } = await import("./live.js");
-  const follow = (stream) => new LiveBuffer(address.href, stream, Link);
+  const follow = (stream) => new LiveBuffer(address.href, stream, parts);
   return { live: true, follow, segments: [], frames: null, fps: null, renditions: [] };
 }
 
@@ -117,11 +113,11 @@ export async function* packetsOf(segment, signal, onPart) {
     walker ??= make();
     walker.push(chunk);
     for (let packet = walker.next(); packet; packet = walker.next()) {
-      // What only streams with a field take.
-      if ([...sectionsOf(packet.data)].includes(FIELD)) await import("./changes/field.js");
+      // Section 10 is a field, and 11, which begins a packet, are layers.
+      if ([...sectionsOf(packet.data)].includes(10)) await import("./changes/field.js");
       yield packet;
     }
-    if (walker.ahead(17)?.[16] === LAYERS) onPart?.(walker);
+    if (walker.ahead(17)?.[16] === 11) onPart?.(walker);
   }
   (walker ?? make()).finish();
 }

@@ -9,7 +9,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -70,7 +70,10 @@ def package(
             _check_frames(path, other, main)
         manifest = {"format": f"gsstream {FORMAT_VERSION}", "poster": POSTER, **main, "renditions": others}
         new = _files(manifest)
-        size = _copy(resources.files("gsstream") / "web", folder)
+        size = 0
+        for name, data in player_files():
+            (folder / name).parent.mkdir(exist_ok=True)
+            size += (folder / name).write_bytes(data)
         page = folder / "index.html"
         _replace(page, _titled(page.read_text(encoding="utf-8"), main["name"]).encode())
         _replace(folder / POSTER, _poster(Path(stream)))
@@ -222,17 +225,16 @@ def _titled(page: str, name: str) -> str:
     )
 
 
-def _copy(source: Traversable, target: Path) -> int:
-    """Copy the player's files, modules of its own without comments and indentation; returns the bytes written."""
-    size = 0
-    for item in source.iterdir():
+def player_files(folder: Traversable | None = None, above: str = "") -> Iterator[tuple[str, bytes]]:
+    """Yield name and bytes of the player's files, modules of its own without comments and indentation.
+
+    ``folder`` and ``above``: where to begin, and its name; by default all files.
+    """
+    folder = resources.files("gsstream") / "web" if folder is None else folder
+    for item in sorted(folder.iterdir(), key=lambda item: item.name):
         if item.is_dir():
-            (target / item.name).mkdir(exist_ok=True)
-            size += _copy(item, target / item.name)
+            yield from player_files(item, f"{above}{item.name}/")
         elif not item.name.startswith((".", "__")):
             data = item.read_bytes()
-            if item.name.endswith(".js") and source.name != "vendor":
-                data = _SPARE.sub(b"", data)
-            (target / item.name).write_bytes(data)
-            size += len(data)
-    return size
+            is_own = item.name.endswith(".js") and folder.name != "vendor"
+            yield f"{above}{item.name}", _SPARE.sub(b"", data) if is_own else data

@@ -8,15 +8,13 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator
-from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
 from gsstream.core.errors import OutputError, PacketError
 from gsstream.packet import FORMAT_VERSION, Entry, PacketKind
 from gsstream.serve.follow import Follower
-from gsstream.serve.package import MANIFEST, SEGMENTS
+from gsstream.serve.package import MANIFEST, SEGMENTS, player_files
 from gsstream.store.place import Place
 from gsstream.store.troubles import StoreSilent
 
@@ -49,7 +47,7 @@ class LivePackage:
     def write_page(self) -> None:
         """Put the player there, and take away the parts of an earlier stream. Raises OutputError."""
         self._gone = [(time.monotonic(), name) for name in self.place.names(f"{PARTS}/") if _NAME.fullmatch(name)]
-        for name, data in _files(resources.files("gsstream") / "web", ""):
+        for name, data in player_files():
             self.place.put(name, data, kept=FOR_MINUTES)
 
     def look(self) -> bool:
@@ -142,12 +140,3 @@ def bring_page(folder: Path, place: Place) -> int:
         kept = FOR_EVER if name.startswith(f"{SEGMENTS}/") else FOR_SECONDS if name == MANIFEST else FOR_MINUTES
         place.put(name, (folder / name).read_bytes(), kept=kept)
     return len(names)
-
-
-def _files(folder: Traversable, above: str) -> Iterator[tuple[str, bytes]]:
-    """The player's files, by their names."""
-    for item in sorted(folder.iterdir(), key=lambda item: item.name):
-        if item.is_dir():
-            yield from _files(item, f"{above}{item.name}/")
-        elif not item.name.startswith((".", "__")):
-            yield f"{above}{item.name}", item.read_bytes()

@@ -39,9 +39,9 @@ def open_source(uri: str, scale: float = 1.0) -> Source:
         from gsstream.input.recordings.watch import WatchSource
 
         return WatchSource.from_query(rest, scale=scale)
-    named = scheme if separator and scheme in LAYOUTS else None
-    if is_address(rest if named else uri):
-        return _fetched(rest if named else uri, named, scale, uri)
+    named, place = _named(uri)
+    if is_address(place):
+        return _fetched(place, named, scale, uri)
     return RecordedSource(read_recording(uri), scale=scale, uri=uri)
 
 
@@ -50,21 +50,27 @@ def read_recording(uri: str) -> Recording:
 
     Raises SourceError for another option, for a folder of no layout or of several, and for a faulty recording.
     """
-    scheme, separator, rest = uri.partition(":")
-    named = scheme if separator and scheme in LAYOUTS else None
-    folder = Path(rest if named else uri)
+    named, place = _named(uri)
+    folder = Path(place)
     # Path takes an empty text for the current folder, which is never what was meant.
     if not (uri and _exists(folder)) and not named:
+        scheme, separator, _ = uri.partition(":")
         if separator and (command := install_part("source", scheme)):
             raise SourceError(f"source {uri[:200]!r}: the source {scheme!r} comes with another distribution: {command}")
         raise SourceError(f"source {uri[:200]!r}: no such folder and no known scheme; expected {_KNOWN}")
     options: dict[str, str] = {}
     if named == "nerfstudio" and not _exists(folder):
-        text, _, query = rest.partition("?")
+        text, _, query = place.partition("?")
         if query not in ("", "missing=refuse", "missing=skip"):
             raise SourceError(f"source {uri[:200]!r}: expected ?missing=skip or ?missing=refuse, got ?{query[:100]}")
         folder, options = Path(text), {"missing": query.partition("=")[2] or "skip"}
     return read_layout(named or detect(folder), folder, **options)
+
+
+def _named(uri: str) -> tuple[str | None, str]:
+    """The layout that an address names, if it does, and the rest of it."""
+    layout, separator, place = uri.partition(":")
+    return (layout, place) if separator and layout in LAYOUTS else (None, uri)
 
 
 def _fetched(address: str, named: str | None, scale: float, uri: str) -> Source:

@@ -108,7 +108,7 @@ def web_server(folder: Path) -> Iterator[tuple[str, list[str]]]:
         def log_message(self, *_: Any) -> None:
             asked.append(f"{self.command} {self.path}")
 
-    with _serving(functools.partial(Quiet, directory=str(folder))) as address:
+    with serving(functools.partial(Quiet, directory=str(folder))) as address:
         yield address, asked
 
 
@@ -132,13 +132,18 @@ def refusing_store() -> Iterator[str]:
         def log_message(self, *_: Any) -> None:
             pass
 
-    with _serving(Refusing) as address:
+    with serving(Refusing) as address:
         yield address
 
 
 @contextmanager
-def _serving(handler: Any) -> Iterator[str]:
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+def serving(handler: Any) -> Iterator[str]:
+    """A web server of this process, whose requests a handler answers; gives its address."""
+
+    class Server(http.server.ThreadingHTTPServer):
+        request_queue_size, daemon_threads = 256, True
+
+    server = Server(("127.0.0.1", 0), handler)
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     try:

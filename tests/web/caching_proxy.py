@@ -12,9 +12,11 @@ import urllib.request
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
+
+from stores import serving
 
 PAGE = Path(__file__).parents[2] / "docs" / "howto" / "many.md"
 #: What the cache hands on besides the file.
@@ -72,7 +74,7 @@ def origin(folder: Path) -> Iterator[tuple[str, Counter[str]]]:
             sent[name] += 1
             self.answer(200, data, headers)
 
-    with _serving(Origin) as address:
+    with serving(Origin) as address:
         yield address, sent
 
 
@@ -121,21 +123,5 @@ def proxy(upstream: str) -> Iterator[str]:
             kept[self.path] = until, data, {name: headers[name] for name in PASSED if name in headers}
             return 200
 
-    with _serving(Proxy) as address:
+    with serving(Proxy) as address:
         yield address
-
-
-@contextmanager
-def _serving(handler: type[_Quiet]) -> Iterator[str]:
-    class Server(ThreadingHTTPServer):
-        request_queue_size, daemon_threads = 256, True
-
-    server = Server(("127.0.0.1", 0), handler)
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_address[1]}"
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()

@@ -89,6 +89,7 @@ def rows_of_sweep(folder: Path, commit: str, at: Sequence[int] = ()) -> list[Row
                     "scene": group.scene,
                     "name": group.label,
                     "seed": run.seed,
+                    "frame_0_of": run.row.get("frame_0_of", ""),
                     "frames": frames,
                     **values,
                     **_phases(run),

@@ -112,6 +112,19 @@ def test_frame_0_is_shared_exactly_where_it_does_not_vary(plan_of):
     assert {p.first for p in plan_of(structure + "first_frame: {share: own}\n").points} == {None}
 
 
+def test_a_variant_names_whose_frame_0_it_takes_over(plan_of):
+    plan = plan_of(
+        f"name: f\n{SCENE}seeds: [0, 1]\nfirst_frame: {{share: scene}}\nvariants: [{{name: v, method: dense}}, "
+        "{name: w, method: dense, set: {first_frame.prune_error: 0}}, {name: x, method: dense, first_frame: w}]\n"
+    )
+    assert {(p.variant, plan.frame_0_of(p)) for p in plan.points} == {("v", "v"), ("w", "v"), ("x", "w")}
+    assert {(run.of, run.resolved.recipe.first_frame.prune_error) for run in plan.firsts.values()} == {
+        ("v", 10.0),
+        ("w", 0.0),
+    }
+    assert {plan.firsts[p.first].seed == p.seed for p in plan.points} == {True}
+
+
 def test_ids_follow_what_decides_a_run_and_nothing_else(plan_of):
     ids = list(plan_of(TWO_SEEDS).cells)
     assert list(plan_of(TWO_SEEDS.replace("name: two", "name: other\ndescription: text")).cells) == ids
@@ -160,6 +173,8 @@ BAD = [
     (f"name: x\n{SCENE}variants: [{{name: v}}]\nsearch: random\nsamples: 2\n"
      "axes: {near: {low: 0, high: 1, log: true}}\n", "above 0"),
     (f"name: x\n{SCENE}variants: [{{name: v}}]\nfirst_frame: {{share: own, seed: 3}}\n", "shared frame 0"),
+    (f"name: x\n{SCENE}variants: [{{name: v, first_frame: w}}]\nfirst_frame: {{share: scene}}\n", "there are .'v'"),
+    (f"name: x\n{SCENE}variants: [{{name: v, first_frame: v}}]\n", "share scene; got 'v' and 'exact'"),
     (f"name: x\n{SCENE}variants: [{{name: v}}]\naxes: {{stream.epoch: [1]}}\n", "did you mean 'epochs'"),
     (f"name: x\n{SCENE}variants: [{{name: v}}]\naxes: {{stream.epochs: [0]}}\n", "greater than or equal to 1"),
     (f"name: x\n{SCENE}variants: [{{name: v}}]\naxes: {{'stream..epochs': [1]}}\n", "expected a recipe key"),

@@ -77,8 +77,8 @@ def _describe(plan: Plan, out: Path) -> str:
         axes = " ".join(f"{key}={value}" for key, value in cell.axes.items())
         failed = known.cells.get(cell.id, {}).get("error")
         state = "kept" if cell.id in done else f"again, failed: {failed}" if failed else "to make"
-        rows.append([cell.id, cell.scene.name, cell.variant, axes, str(cell.seed), cell.first or "own", state])
+        rows.append([cell.id, cell.scene.name, cell.variant, axes, str(cell.seed), plan.frame_0_of(cell), state])
     open_ = sum(row[-1] != "kept" for row in rows)
     firsts = sum(not first_frame_file(out, key).is_file() for key in plan.firsts)
-    text = table(["cell", "scene", "variant", "axes", "seed", "frame 0", "state"], rows)
+    text = table(["cell", "scene", "variant", "axes", "seed", "frame 0 of", "state"], rows)
     return f"{text}\n\n{plural(len(rows), 'cell')}, {open_} to make; {plural(firsts, 'shared frame 0')} to make first"

@@ -78,6 +78,11 @@ class Variant(Section):
         "with the seed of the cell",
     )
     axes: dict[str, Axis] = Field(default_factory=dict, description="axes of this variant, besides those of all")
+    first_frame: str | None = Field(
+        default=None,
+        description="with first_frame.share scene: the variant whose frame 0, of the same scene and seed, is taken "
+        "over; default: the file's first",
+    )
     base_seeds: list[int] = Field(
         default_factory=list,
         description="search 'each': further seeds of the variant as it is, to tell differences from noise",
@@ -96,7 +101,8 @@ class FirstFrame(Section):
     share: Literal["exact", "scene", "own"] = Field(
         default="exact",
         description="exact: cells of one scene and seed with equal settings of frame 0 (structure included) share it; "
-        "scene: all cells of a scene and seed take over the one of the first variant; own: none is shared",
+        "scene: all cells of a scene and seed take over the one of the first variant, or of the one that they name; "
+        "own: none is shared",
     )
     seed: int | None = Field(default=None, ge=0, description="seed of a shared frame 0; default: the cell's own")
 
@@ -166,6 +172,12 @@ class SweepConfig(Section):
                     f"seeds {self.seeds}; got search {self.search!r} and {variant.base_seeds}"
                 )
         names = [variant.name for variant in self.variants]
+        for variant in self.variants:
+            if variant.first_frame and (variant.first_frame not in names or self.first_frame.share != "scene"):
+                raise ValueError(
+                    f"first_frame of {variant.name}: expected a variant of this file and first_frame.share scene; got "
+                    f"{variant.first_frame!r} and {self.first_frame.share!r}; there are {names}"
+                )
         unknown = {name for rows in self.paper_tables.values() for name in rows.values()} - set(names)
         if unknown:
             raise ValueError(f"paper_tables names variants that are not there: {sorted(unknown)}; there are {names}")
@@ -180,6 +192,13 @@ class SweepConfig(Section):
         if self.search == "random" and not axes:
             raise ValueError("'search: random' needs axes to draw from")
         return self
+
+    def leader_of(self, variant: Variant) -> Variant | None:
+        """Return the variant whose frame 0 this one takes over; None: its own, or that of equal settings."""
+        if self.first_frame.share != "scene":
+            return None
+        name = variant.first_frame or self.variants[0].name
+        return next(other for other in self.variants if other.name == name)
 
 
 class SceneList(Section):

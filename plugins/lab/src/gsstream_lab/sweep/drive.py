@@ -129,7 +129,9 @@ class _Drive:
         if outcome.error is None:
             write_whole(cell_file(self.out, cell.id), outcome.stream)
         place = {"scene": cell.scene.name, "variant": cell.variant, "axes": dict(cell.axes), "seed": cell.seed}
-        self._record("cell", cell, outcome, {**place, "first_frame": cell.first})
+        self._record(
+            "cell", cell, outcome, {**place, "first_frame": cell.first, "frame_0_of": self.plan.frame_0_of(cell)}
+        )
         self.made += 1
         count = f"[{len(self.kept) + self.made}/{len(self.kept) + len(self.cells)}]"
         if outcome.error is not None:

@@ -41,17 +41,18 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class FirstFrameRun:
-    """A frame 0 that several cells take over: the recipe of the first of them, one frame long."""
+    """A frame 0 that several cells take over: the recipe of variant ``of``, one frame long."""
 
     id: str
     scene: Scene
+    of: str
     seed: int
     resolved: ResolvedRecipe
 
     @property
     def label(self) -> str:
-        """``basketball frame 0 seed 0``."""
-        return f"{self.scene.name} frame 0 seed {self.seed}"
+        """``basketball frame 0 of s2gs-edge seed 0``."""
+        return f"{self.scene.name} frame 0 of {self.of} seed {self.seed}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +73,10 @@ class Plan:
             out.setdefault(point.id, point)
         return out
 
+    def frame_0_of(self, cell: Cell) -> str:
+        """Return the name of the variant that made the frame 0 of a cell."""
+        return self.firsts[cell.first].of if cell.first else cell.variant
+
 
 def make_plan(config: SweepConfig, folder: Path, find_method: FindMethod) -> Plan:
     """Resolve every cell of a sweep.
@@ -82,19 +87,19 @@ def make_plan(config: SweepConfig, folder: Path, find_method: FindMethod) -> Pla
     points: list[Cell] = []
     firsts: dict[str, FirstFrameRun] = {}
     for scene, seed in itertools.product(config.scenes, _all_seeds(config)):
-        leader = config.variants[0]
-        lead = _resolve(config, scene, leader, axes={}, seed=seed, folder=folder, find_method=find_method)
         for variant in config.variants:
-            recorded = _recorded(scene, variant, seed)
+            recorded, leader = _recorded(scene, variant, seed), config.leader_of(variant)
             for axes in _points(config, variant, seed):
                 resolved = _resolve(
                     config, scene, variant, axes=axes, seed=seed, folder=folder, find_method=find_method
                 )
                 first = None
-                if config.first_frame.share != "own":
-                    shared = config.first_frame.share == "scene"
-                    one = (_recorded(scene, leader, seed), lead) if shared else (recorded, resolved)
-                    made = _first_frame(config, *one, seed)
+                if leader is not None:
+                    lead = _resolve(config, scene, leader, axes={}, seed=seed, folder=folder, find_method=find_method)
+                    made = _first_frame(config, _recorded(scene, leader, seed), leader, resolved=lead, seed=seed)
+                    first = firsts.setdefault(made.id, made).id
+                elif config.first_frame.share == "exact":
+                    made = _first_frame(config, recorded, variant, resolved=resolved, seed=seed)
                     first = firsts.setdefault(made.id, made).id
                 points.append(
                     Cell(
@@ -192,13 +197,15 @@ def disturbed_uri(uri: str, disturbed: str | None, seed: int) -> str:
     return uri if disturbed is None else f"disturbed:{disturbed},seed={seed}:{uri}"
 
 
-def _first_frame(config: SweepConfig, scene: Scene, resolved: ResolvedRecipe, seed: int) -> FirstFrameRun:
+def _first_frame(
+    config: SweepConfig, scene: Scene, variant: Variant, resolved: ResolvedRecipe, seed: int
+) -> FirstFrameRun:
     seed = seed if config.first_frame.seed is None else config.first_frame.seed
     recipe = resolved.recipe.model_copy(update={"seed": seed, "frames": 1})
     values = recipe.model_dump(mode="json")
     values["budget"] = {"memory": values["budget"]["memory"]}  # of a budget, frame 0 knows memory alone
     key = _hash([scene.uri, seed, {k: v for k, v in values.items() if k not in LATER_KEYS}])
-    return FirstFrameRun(key, scene, seed, ResolvedRecipe(recipe, resolved.origins))
+    return FirstFrameRun(key, scene, variant.name, seed, ResolvedRecipe(recipe, resolved.origins))
 
 
 def _cell_id(config: SweepConfig, scene: Scene, resolved: ResolvedRecipe, first: str | None) -> str:

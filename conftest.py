@@ -37,19 +37,18 @@ ROOT = Path(__file__).parent
 #: Files that take longest, longest first. They are begun first: a long file that is begun last keeps one core busy
 #: while the others wait. A name that is missing here costs only time.
 LONG = (
-    "flow/test_closed_loop", "flow/test_kills", "flow/test_repeat_and_resume", "flow/test_resume",
-    "flow/test_key_refresh", "lab/tests/test_sweep_real",
+    "input/prepare/test_prepare", "input/prepare/test_validate", "flow/test_kills", "flow/test_first_look",
+    "flow/test_followed_light", "flow/test_odd_runs", "input/faults/test_faults_and_readers", "flow/test_closed_loop",
+    "flow/test_resume", "flow/test_repeat_and_resume", "flow/test_cost_follows_change", "flow/test_budget",
+    "flow/test_still_frames", "flow/test_key_refresh", "lab/tests/test_sweep_real",
     "cpu_render/tests/test_cross_aarch64", "contract/test_new_plugin", "contract/test_howtos",
-    "discovery/test_six_rings", "lab/tests/test_paper_configs", "web/test_page", "flow/test_budget",
-    "contract/test_saboteurs", "contract/test_shipped_plugins", "flow/test_no_overshoot", "web/test_live_page",
-    "flow/test_odd_runs", "web/test_decoder", "input/prepare/test_prepare",
-    "flow/test_cost_follows_change", "flow/test_bad_input",
-    "web/test_page_joins", "flow/test_checks", "packet/test_fuzz", "flow/test_run_ends", "flow/test_watch",
-    "flow/test_worlds", "input/prepare/test_validate", "lab/tests/test_tune", "queen/tests/test_queen_stream",
-    "lab/tests/test_batch", "store/test_run_by_address", "store/test_fetch", "web/test_many_viewers",
-    "tools/test_soak", "flow/test_still_frames", "packet/test_corrupt", "input/seeds/test_depth_maps",
-    "input/recordings/test_layouts",
-    "flow/test_light_process", "player/test_player_memory", "evaluation/test_evaluation", "lab/tests/test_compare",
+    "discovery/test_six_rings", "lab/tests/test_paper_configs", "web/test_page", "contract/test_saboteurs",
+    "contract/test_shipped_plugins", "flow/test_no_overshoot", "web/test_live_page", "web/test_decoder",
+    "flow/test_bad_input", "web/test_page_joins", "flow/test_checks", "packet/test_fuzz", "flow/test_run_ends",
+    "flow/test_watch", "flow/test_worlds", "lab/tests/test_tune", "queen/tests/test_queen_stream",
+    "lab/tests/test_batch", "store/test_run_by_address", "store/test_fetch", "web/test_many_viewers", "tools/test_soak",
+    "packet/test_corrupt", "input/seeds/test_depth_maps", "input/recordings/test_layouts", "flow/test_light_process",
+    "player/test_player_memory", "evaluation/test_evaluation", "lab/tests/test_compare",
 )  # fmt: skip
 #: What ``make check`` runs: rooms whose tests are cheap, and the one test of whole runs that must never fail.
 QUICK = (

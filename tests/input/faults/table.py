@@ -7,6 +7,7 @@ is made.
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 import tempfile
 import warnings
@@ -32,6 +33,8 @@ from tests.input.faults.readers import FISHEYE, FRAMES, RATE, READERS, Edit, Rea
 from tests.input.recordings.scenes import write_png, write_video
 
 CELLS = Path(__file__).parent / "cells.json"
+#: Sound recordings, until the process ends.
+SOUND = tempfile.TemporaryDirectory(prefix="sound-")
 #: What ``scene validate`` calls a recording that cannot be read.
 UNREADABLE = ("calibration", "files", "images")
 
@@ -106,12 +109,18 @@ def answers(reader: Reader, folder: Path) -> dict[str, Answer]:
 
 
 @cache
+def written(name: str) -> Path:
+    """The folder of the sound recording; written once, since compressing its pictures is most of what a cell costs."""
+    folder = Path(SOUND.name) / str(list(READERS).index(name))
+    folder.mkdir()
+    READERS[name].write(folder)
+    return folder
+
+
+@cache
 def sound(name: str) -> dict[str, Answer]:
     with tempfile.TemporaryDirectory() as place:
-        folder = Path(place) / "scene"
-        folder.mkdir()
-        READERS[name].write(folder)
-        return answers(READERS[name], folder)
+        return answers(READERS[name], shutil.copytree(written(name), Path(place) / "scene"))
 
 
 # faults ------------------------------------------------------------------------------------------------------
@@ -408,9 +417,7 @@ def cell(fault: str, name: str) -> tuple[str, str]:
     if isinstance(edit, str):
         return "does not apply", edit
     with tempfile.TemporaryDirectory() as place:
-        folder = Path(place) / "scene"
-        folder.mkdir()
-        reader.write(folder)
+        folder = shutil.copytree(written(name), Path(place) / "scene")
         edit(folder)
         given = answers(reader, folder)
         first = given.get("run", given["prepare"])

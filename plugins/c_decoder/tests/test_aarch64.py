@@ -7,8 +7,9 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from many_streams import play_all
 
-from gsstream.packet.conformance import judge, load_cases, play_with
+from gsstream.packet.conformance import judge, load_cases
 
 HERE = Path(__file__).parent
 SOURCES = sorted(path for path in (HERE.parent / "src" / "c").glob("*.c") if path.name != "gss_info.c")
@@ -32,13 +33,13 @@ def build(program: Path, contract: str) -> list[str]:
 
 
 def test_all_vectors_are_played_and_refused(tmp_path: Path) -> None:
-    play = play_with(build(tmp_path / "dump", "off"))
-    results = [judge(case, play(case.path)) for case in CASES]
+    outcomes = play_all(build(tmp_path / "dump", "off"), CASES)
+    results = [judge(case, outcome) for case, outcome in zip(CASES, outcomes, strict=True)]
     assert [result for result in results if result.problem or result.left_out] == []
 
 
 def test_the_suite_notices_products_that_are_fused_with_sums(tmp_path: Path) -> None:
     """This processor has an instruction for both; a build without -ffp-contract=off may use it (R-0.4-1)."""
-    play = play_with(build(tmp_path / "dump", "fast"))
     rounding = [case for case in CASES if "rounding" in case.features]
-    assert [case.name for case in rounding if judge(case, play(case.path)).problem]
+    outcomes = play_all(build(tmp_path / "dump", "fast"), rounding)
+    assert [case.name for case, outcome in zip(rounding, outcomes, strict=True) if judge(case, outcome).problem]

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+from many_streams import play_all
 
 from gsstream.packet.conformance import judge, load_cases, play_here, play_with
 
@@ -50,14 +51,24 @@ def dump(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_all_vectors_are_played_and_refused(dump: Path) -> None:
-    play = play_with([str(dump)])
-    results = [judge(case, play(case.path)) for case in load_cases(SUITE)]
+    cases = load_cases(SUITE)
+    outcomes = play_all([str(dump)], cases)
+    results = [judge(case, outcome) for case, outcome in zip(cases, outcomes, strict=True)]
     assert [result for result in results if result.problem or result.left_out] == []
 
 
+def test_a_process_of_its_own_prints_the_same_and_its_code_says_how_a_stream_ended(dump: Path) -> None:
+    """What the contract asks of a decoder; a few streams, each refused in another part of the decoder."""
+    cases = load_cases(SUITE)
+    chosen = [*[case for case in cases if not case.refused][::40], *[case for case in cases if case.refused][::20]]
+    assert [play_with([str(dump)])(case.path) for case in chosen] == play_all([str(dump)], chosen)
+    assert play_with([str(dump)])(SUITE / "play" / "nothing.gss").code == 2
+
+
 def test_vectors_and_mutants_under_sanitisers(tmp_path: Path) -> None:
-    play = play_with([str(sanitised(tmp_path / "dump", source("gss_dump")))])
-    assert [r for case in load_cases(SUITE) if (r := judge(case, play(case.path))).problem] == []
+    cases = load_cases(SUITE)
+    outcomes = play_all([str(sanitised(tmp_path / "dump", source("gss_dump")))], cases)
+    assert [r for case, outcome in zip(cases, outcomes, strict=True) if (r := judge(case, outcome)).problem] == []
     mutants = sanitised(tmp_path / "mutants", HERE / "mutants.c")
     seeds = [str(path) for path in sorted((SUITE / "play").iterdir())]
     done = subprocess.run([mutants, "0", "800", *seeds], capture_output=True, text=True, timeout=300, check=False)

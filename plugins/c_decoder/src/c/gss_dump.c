@@ -1,4 +1,5 @@
-/* Print the index and the hash of every frame of a stream: the conformance program of this decoder. */
+/* Print the index and the hash of every frame of a stream: the conformance program of this decoder. Of several streams
+   the path comes first, and the exit code is the highest. */
 #include "gss.h"
 
 #include <stdio.h>
@@ -29,12 +30,12 @@ static void *read_file(const char *path, size_t *size)
     return bytes;
 }
 
-int main(int count, char **words)
+static int dump(const char *path)
 {
     size_t size;
-    void *bytes = count == 2 ? read_file(words[1], &size) : NULL;
+    void *bytes = read_file(path, &size);
     if (!bytes) {
-        fprintf(stderr, count == 2 ? "cannot read %s\n" : "usage: gss_dump STREAM\n", words[count - 1]);
+        fprintf(stderr, "cannot read %s\n", path);
         return 2;
     }
     gss_stream *stream = gss_open(bytes, size, 0);
@@ -51,4 +52,20 @@ int main(int count, char **words)
     gss_close(stream);
     free(bytes);
     return found == GSS_END ? 0 : found == GSS_REFUSED ? 1 : 2;
+}
+
+int main(int count, char **words)
+{
+    int worst = 0;
+    if (count < 2) {
+        fprintf(stderr, "usage: gss_dump STREAM [STREAM ...]\n");
+        return 2;
+    }
+    for (int i = 1; i < count; i++) {
+        if (count > 2)
+            printf("file %s\n", words[i]);
+        int code = dump(words[i]);
+        worst = code > worst ? code : worst;
+    }
+    return worst;
 }

@@ -32,8 +32,9 @@ class SyntheticOptions(BaseModel):
     scene: SceneName = Field(
         default="paths",
         description="what happens. paths: two objects on smooth paths; at frame 'event' they stop (stop) or turn back "
-        "(reversal), or the light flashes for that frame (flash), is brighter from it on (lamp) or falls slowly from "
-        "it on (dim); a ball bounces off the floor (bounce) or goes through a tunnel (occlusion)",
+        "(reversal), or the light flashes for that frame (flash), is brighter from it on (lamp), or falls slowly from "
+        "it on, everywhere (dim) or on one side of the room (cloud); a ball bounces off the floor (bounce) or goes "
+        "through a tunnel (occlusion)",
     )
     event: int = Field(default=8, ge=1, le=100_000, description="the frame at which the scene's event happens")
     frames: int = Field(default=40, ge=1, description="number of frames")
@@ -171,11 +172,12 @@ class SyntheticSource(Source):
         albedo = np.where(front[:, None], moving.albedo, behind.albedo)
         light = light.copy()
         light[front] = np.maximum(moving.normal[front] @ LIGHT, 0)
+        distance = np.minimum(moving.distance, behind.distance)
         if self._options.shadows:
-            self._cast_shadows(
-                origin, rays, np.minimum(moving.distance, behind.distance), front=front, light=light, shapes=shapes
-            )
+            self._cast_shadows(origin, rays, distance, front=front, light=light, shapes=shapes)
         colors = albedo * (_AMBIENT + (1 - _AMBIENT) * light)[:, None] * np.float32(self._scene.light(index))
+        if self._options.scene == "cloud":
+            colors *= self._scene.shade(index, origin + rays * distance[:, None])[:, None]
         n = self._options.supersample
         fine = colors.reshape(cameras.height, n, cameras.width, n, 3)
         image = sum(fine[:, y, :, x] for y in range(n) for x in range(n)) / np.float32(n * n)

@@ -15,7 +15,7 @@ from gsstream.core.shapes import FloatArray
 from gsstream.input.recordings.primitives import Box, Placed, Sphere, Surface
 from gsstream.input.recordings.toyroom import moving_shapes, static_shapes
 
-SceneName = Literal["paths", "stop", "reversal", "bounce", "occlusion", "flash", "lamp", "dim"]
+SceneName = Literal["paths", "stop", "reversal", "bounce", "occlusion", "flash", "lamp", "dim", "cloud"]
 #: Path of a body from one frame to the next with the option motion = 1, metres: about 5 pixels at a width of 160.
 STEP = 0.08
 #: Light in the frame of a flash, as a multiple of the light in other frames.
@@ -24,8 +24,10 @@ FLASH = 1.6
 LAMP = 1.3
 #: Share of the light that is lost in every frame while the light dims, and the share that is left in the end.
 DIM, DARKEST = 0.0025, 0.6
+#: Half of the width of the cloud's rim, metres: on the one side of it the light falls, on the other it stays.
+RIM = 0.6
 #: Scenes whose objects go the way of "paths", with another clock or none.
-_ON_PATHS = ("paths", "stop", "reversal", "flash", "lamp", "dim")
+_ON_PATHS = ("paths", "stop", "reversal", "flash", "lamp", "dim", "cloud")
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +77,22 @@ class ToyScene:
         """Return the factor on all colours at a frame."""
         late = index - self.event
         if self.name == "dim":
-            return max(1 - DIM * max(late, 0), DARKEST)
+            return _dimmed(late)
         if self.name == "lamp":
             return LAMP if late >= 0 else 1.0
         return FLASH if self.name == "flash" and late == 0 else 1.0
+
+    def shade(self, index: int, places: FloatArray) -> FloatArray:
+        """Return the factor [P] on the colours of places [P, 3], scene units: below 1 under the cloud, where y > 0."""
+        under = np.clip(0.5 + places[:, 1] / (2 * RIM), 0, 1).astype(np.float32)
+        darkest = _dimmed(index - self.event) if self.name == "cloud" else 1.0
+        factor: FloatArray = 1 - under * np.float32(1 - darkest)
+        return factor
+
+
+def _dimmed(late: int) -> float:
+    """Light that is left so many frames after it began to fall."""
+    return max(1 - DIM * max(late, 0), DARKEST)
 
 
 def _surface(number: int, color: tuple[float, float, float]) -> Surface:

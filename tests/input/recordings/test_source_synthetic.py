@@ -209,6 +209,27 @@ def test_the_light_stays_changed_and_nothing_else_does(name: str, later: list[fl
             assert np.array_equal(center, changed.object_positions(index)[body])
 
 
+def test_a_cloud_darkens_one_side_of_the_room_and_no_place_of_the_other() -> None:
+    """The factor of every pixel follows from its depth; across the rim it falls from 1 to that of the scene 'dim'."""
+    changed, paths, dim = scene("cloud"), scene("paths"), scene("dim")
+    assert changed.frame(EVENT).images.tobytes() == paths.frame(EVENT).images.tobytes()
+    for split in ("train", "test"):
+        before, after, dark = (source.frame(19, split).images for source in (paths, changed, dim))
+        cameras = paths.frame(19, split).cameras
+        depth = paths.depth(19, split)
+        for i in range(len(cameras)):
+            x, y = np.meshgrid(np.arange(cameras.width) + 0.5, np.arange(cameras.height) + 0.5)
+            rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(cameras.Ks[i]).T @ cameras.viewmats[i, :3, :3]
+            across = cameras.centers[i][1] + rays[..., 1] * depth[i]
+            left, right = across < -1, across > 1  # a pixel wide away from the rim
+            assert left.sum() > 20
+            assert right.sum() > 20
+            assert np.array_equal(after[i][left], before[i][left])
+            assert np.array_equal(after[i][right], dark[i][right])
+            assert before[i][right].mean() - after[i][right].mean() > 1 / 255
+            assert np.all(after[i] <= before[i])
+
+
 def test_nothing_happens_where_nothing_moves_and_a_wrong_name_is_explained() -> None:
     for name in ("stop", "reversal", "bounce", "occlusion"):
         still = scene(name, static=1)

@@ -35,6 +35,7 @@ CASES: dict[str, tuple[str, dict[str, Any], int]] = {
     "light": ("gain_amplitude=0.4,gain_pattern=random,seed=2", {"gain_amplitude": 0.4, "gain_pattern": "random"}, 2),
     "losses": ("lost_share=0.5,lost_as=black,seed=1", {"lost_share": 0.5, "lost_as": "black"}, 1),
     "cameras": ("lost_cameras=NAME@3-6+NAME@8-9", {"lost_cameras": ("NAME@3-6", "NAME@8-9")}, 0),
+    "drift": ("drift=NAME@-0.01", {"drift": ("NAME@-0.01",)}, 0),
     "clocks": ("time_offset=NAME@2", {"time_offset": ("NAME@2",)}, 0),
 }
 
@@ -161,6 +162,24 @@ def test_gain_touches_test_cameras_and_saturates() -> None:
         assert truth.max() == 1
 
 
+def test_one_camera_drifts_in_exposure_or_colour_and_no_other() -> None:
+    plain = open_source(WORLD)
+    one, test = plain.info.train.ids[1], plain.info.test.ids[0]
+    for text, shares, split, row in (
+        (f"{one}@-0.02", [-0.02] * 3, "train", 1),
+        (f"{one}@0.3", [0.3] * 3, "train", 1),
+        (f"{test}@0.02/0/-0.02", [0.02, 0, -0.02], "test", 0),
+    ):
+        source = disturbed(drift=(text,))
+        for index in (0, 1, 7):
+            before, after = plain.frame(index, split).images, source.frame(index, split).images.copy()
+            wanted = np.clip(before[row] * (1 + index * np.float32(shares)), 0, 1)
+            np.testing.assert_allclose(after[row], wanted, atol=1e-6)
+            after[row] = before[row]
+            assert np.array_equal(after, before)
+        assert not source.stores_bytes
+
+
 def test_noise_has_its_sigma_hits_training_images_of_the_first_frames_and_follows_the_seed() -> None:
     plain = open_source(WORLD.replace("width=16&height=12", "width=96&height=72"))
     source = DisturbedSource(plain, Disturbances(noise_sigma=10, noise_frames=2), 5, WORLD)
@@ -218,6 +237,10 @@ FAULTS = {
     "disturbed:lost_cameras=cam03@5-5:demo": "expected ID@A-B with 1 <= A < B",
     "disturbed:lost_cameras=cam03@0-5:demo": "frame 0 needs every training camera",
     "disturbed:ways=0:demo": "greater than or equal to 1.*there, back",
+    "disturbed:drift=cam03:demo": "drift: expected ID@SHARE",
+    "disturbed:drift=cam03@0/0:demo": "ID@RED/GREEN/BLUE.*got 'cam03@0/0'",
+    "disturbed:drift=cam03@nan:demo": "between -1 and 1",
+    "disturbed:drift=cam9@0.1:demo": "drift: no camera 'cam9'",
     "disturbed:time_offset=cam03:demo": "expected ID@FRAMES",
     "disturbed:time_offset=cam03@0.5:demo": "whole frames",
     "disturbed:time_offset=cam9@1:demo": "time_offset: no camera 'cam9'",
@@ -240,7 +263,13 @@ TINY = "synthetic:frames=6&views=3&width=32&height=24&supersample=1"
 @parametrize_with_checks(
     [
         SourceUnderTest(open_disturbed, f"disturbed:{text}:{TINY}")
-        for text in ("gain=0.9,noise_sigma=5", "lost_share=0.5,lost_as=black", "time_offset=cam01@2", "ways=3")
+        for text in (
+            "gain=0.9,noise_sigma=5",
+            "lost_share=0.5,lost_as=black",
+            "time_offset=cam01@2",
+            "ways=3",
+            "drift=cam01@-0.1",
+        )
     ]
 )
 def test_it_is_a_source_like_any_other(check) -> None:

@@ -32,6 +32,11 @@ class Disturbances(BaseModel):
         default="sine", description="sine: smooth, frame 0 has factor gain; random: uniform, anew in every frame"
     )
     gain_period: float = Field(default=60.0, gt=0, description="frames per period of the sine")
+    drift: tuple[str, ...] = Field(
+        default=(),
+        description="ID@SHARE+... or ID@RED/GREEN/BLUE+...: this camera's images get brighter by this share (below 0: "
+        "darker) from each frame to the next, as its exposure or white balance drifts, e.g. c3@-0.0025",
+    )
     noise_sigma: float = Field(
         default=0.0, ge=0, le=255, description="noise on training images, 8-bit levels, clipped to [0, 1] (paper: 0-30)"
     )
@@ -57,7 +62,7 @@ class Disturbances(BaseModel):
 
 
 _KEYS = ("seed", *Disturbances.model_fields)
-_PER_CAMERA = ("lost_cameras", "time_offset")
+_PER_CAMERA = ("drift", "lost_cameras", "time_offset")
 
 
 def parse_disturbances(text: str) -> tuple[Disturbances, int]:
@@ -90,6 +95,28 @@ def parse_offsets(entries: Sequence[str], ids: Sequence[str]) -> dict[str, int]:
                 f"disturbed source: time_offset: expected ID@FRAMES+..., whole frames, e.g. cam03@2, got {entry!r}"
             )
         found[known_camera("disturbed source: time_offset", name, ids, found)] = int(value)
+    return found
+
+
+def parse_drifts(entries: Sequence[str], ids: Sequence[str]) -> dict[str, FloatArray]:
+    """Return camera -> shares [3] by which its channels change in a frame, from "ID@SHARE" or "ID@RED/GREEN/BLUE".
+
+    Raises SourceError naming the entry.
+    """
+    found: dict[str, FloatArray] = {}
+    for entry in entries:
+        name, _, text = entry.rpartition("@")
+        try:
+            shares = [float(part) for part in text.split("/")]
+        except ValueError:
+            shares = []
+        if len(shares) not in (1, 3) or not all(-1 < share < 1 for share in shares):
+            raise SourceError(
+                "disturbed source: drift: expected ID@SHARE+... or ID@RED/GREEN/BLUE+..., shares between -1 and 1, "
+                f"e.g. cam03@-0.0025, got {entry!r}"
+            )
+        camera = known_camera("disturbed source: drift", name, ids, tuple(found))
+        found[camera] = np.resize(np.array(shares, np.float32), 3)
     return found
 
 
@@ -129,11 +156,11 @@ def gain_at(options: Disturbances, index: int, rng: Rng) -> float:
     return options.gain * (1 + options.gain_amplitude * wave)
 
 
-def with_gain(image: FloatArray, factor: float) -> FloatArray:
-    """Return the image times a factor; what exceeds 1 saturates, as in a camera."""
-    if factor == 1:
+def with_gain(image: FloatArray, factor: float | FloatArray) -> FloatArray:
+    """Return the image times a factor, or one for each channel [3]; what exceeds 1 saturates, as in a camera."""
+    if np.all(np.asarray(factor) == 1):
         return image
-    out: FloatArray = np.minimum(image * np.float32(factor), np.float32(1))
+    out: FloatArray = np.clip(image * np.asarray(factor, np.float32), 0, 1)
     return out
 
 

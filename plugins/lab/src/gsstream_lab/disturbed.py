@@ -30,6 +30,7 @@ from gsstream_lab.disturbances import (
     gain_at,
     is_lost,
     parse_disturbances,
+    parse_drifts,
     parse_losses,
     parse_offsets,
     recorded_frame,
@@ -61,7 +62,7 @@ class DisturbedSource(Wrapped):
     Frame t of the run is frame ``start + t + offset`` of the recording for each camera, where ``start`` makes room for
     negative offsets; the run is shorter by the span of the offsets, so that no frame of a camera is shown twice. With
     several ways, the recording is gone through forwards and backwards in turn. Order: ways, time offset, gain (all
-    cameras), noise, losses and the rounding of storage (training cameras).
+    cameras), drift, noise, losses and the rounding of storage (training cameras).
     """
 
     def __init__(self, source: Source, disturbances: Disturbances, seed: int, uri: str) -> None:
@@ -69,6 +70,7 @@ class DisturbedSource(Wrapped):
         self._disturbances, self._rng, info = disturbances, Rng(seed), source.info
         ids = (*info.train.ids, *info.test.ids)
         self._offsets = parse_offsets(disturbances.time_offset, ids)
+        self._drifts = parse_drifts(disturbances.drift, ids)
         self._losses = parse_losses(disturbances.lost_cameras, info.train.ids)
         used = [self._offsets.get(name, 0) for name in ids]
         self._start = max(0, -min(used))
@@ -106,6 +108,8 @@ class DisturbedSource(Wrapped):
             return np.zeros((self._info.train.height, self._info.train.width, 3), np.float32)
         image = self._source.image(self._place(shown) + self._offsets.get(camera, 0), camera)
         image = with_gain(image, gain_at(options, shown, self._rng))
+        if camera in self._drifts:
+            image = with_gain(image, 1 + self._drifts[camera] * np.float32(shown))
         if training and options.noise_sigma > 0 and shown < options.noise_frames:
             image = with_noise(image, options.noise_sigma, camera, index=shown, rng=self._rng)
         return image
@@ -122,7 +126,7 @@ class DisturbedSource(Wrapped):
     def stores_bytes(self) -> bool:
         """Whether the inner source hands over bytes, which no gain and no noise takes off their levels."""
         options = self._disturbances
-        same = options.gain == 1 and options.gain_amplitude == 0 and options.noise_sigma == 0
+        same = options.gain == 1 and options.gain_amplitude == 0 and options.noise_sigma == 0 and not self._drifts
         return same and self._source.stores_bytes
 
     def moment(self, index: int) -> Moment:

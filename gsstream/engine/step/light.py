@@ -130,7 +130,7 @@ class Wanted:
         change: [N, 3] of sh0.
         worth: [N] squared error of one channel, summed over pixels, per square of a change.
         error: mean squared error of one channel of the pixels that were asked.
-        cameras: [V, 3] what each camera shows beyond what all show together, image units. It is reported, not drawn.
+        cameras: [V, 3] what each camera shows beyond what most show, image units. It is reported, not drawn.
     """
 
     change: FloatArray
@@ -170,8 +170,9 @@ def wanted_colours(assembly: Assembly, scene: Gaussians[torch.Tensor], work: Eng
 def camera_offsets(asked_by_view: torch.Tensor, asked: torch.Tensor, light: torch.Tensor) -> torch.Tensor:
     """Return [V, 3]: what each camera asks of all colours it sees, beyond what the others ask of the same.
 
-    The least squares of a colour a row and an offset a camera together, with the rows eliminated; of all solutions the
-    shortest, whose offsets have the mean 0: what all cameras ask for is the light's.
+    The least squares of a colour a row and an offset a camera together, with the rows eliminated. All offsets may be
+    larger by the same and all colours smaller: of all solutions the one whose offsets have the median 0, because what
+    most cameras ask for is the light's, and what a few ask for beyond it is their own, however much it is.
 
     Arguments:
         asked_by_view, asked: [V, 3], [N, 3] errors, summed over rows and over views, of which each is a sum over pixels
@@ -183,4 +184,6 @@ def camera_offsets(asked_by_view: torch.Tensor, asked: torch.Tensor, light: torc
     matrix = light.sum(1).diag() - shares @ light.T
     right = asked_by_view.double() - shares @ asked.double()
     inverse: torch.Tensor = torch.linalg.pinv(matrix, rtol=1e-6, hermitian=True)
-    return (inverse @ right).float()
+    offsets = inverse @ right
+    seen = offsets[light.sum(1) > 0]
+    return (offsets - seen.quantile(0.5, 0)).float() if len(seen) else offsets.float()

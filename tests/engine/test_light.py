@@ -8,6 +8,7 @@ import torch
 
 from gsstream.core.changes import Delta, Layout, Residual, Scene, apply_delta, sent_rows
 from gsstream.core.gaussians import SH0
+from gsstream.encode import open_recording
 from gsstream.engine.fit.photometric import FrameImages
 from gsstream.engine.state.drift import Drift, Lit, drift, looked_at, tile_shares
 from gsstream.engine.step.light import camera_offsets
@@ -62,6 +63,16 @@ def test_the_light_is_due_when_it_drifted_and_starts_anew_after_a_jump(change: f
     found = drift(before, now, levels=1)
     assert (found.is_due, found.lit.frame if found.lit else None) == (due, frame)
     assert drift(None, now, levels=1) == Drift(now, False)
+
+
+def test_no_pass_is_due_in_the_demo_whatever_frames_are_compared() -> None:
+    """Its light stays, and what moves in it is no light: so its packets hold no byte of any."""
+    with open_recording("demo") as source:
+        frames = [
+            looked_at(i, FrameImages(source.frame(i).as_stored().images, torch.device("cpu")))
+            for i in range(source.info.num_frames or 0)
+        ]
+    assert not any(drift(before, now, levels=1).is_due for before in frames for now in frames)
 
 
 def test_rows_and_cameras_share_what_is_asked_for_as_it_came_about() -> None:

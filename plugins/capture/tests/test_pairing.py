@@ -220,6 +220,15 @@ def test_a_clock_is_trusted_after_two_reports() -> None:
     assert clock.kind == "sender"
 
 
+@given(st.floats(-0.3, 1.9), st.floats(-0.2, 0.2))
+def test_a_camera_that_is_back_is_trusted_at_once_where_its_pictures_take_as_long_as_before(way, off) -> None:
+    clock, _ = told([5000.0, 5000.0], way=way)
+    again = SenderClock(0.05, before=clock.usual)
+    out = [again.observe(k / 10, 7000 + k / 10, report=k == 0, arrival=7000 + k / 10 + way + off) for k in range(9)]
+    assert (None not in out) == (abs(off) < 0.05 - 1e-9) or abs(abs(off) - 0.05) < 1e-6
+    assert len(set(map(type, out))) == 1
+
+
 def test_a_first_report_that_is_off_never_reaches_a_picture() -> None:
     """Seen: the first report of a busy sender was 2.2 s off until its second."""
     clock, out = told([5002.2, 5000.0, 5000.001])

@@ -280,7 +280,7 @@ def _tell_changes(live: LiveRig, states: dict[int, Any], say: Say) -> None:
     for reader in live.readers:
         state, name = reader.health.state, reader.spec.id
         gone = "silent" if reader.health.state == "live" and here() - reader.health.last > TIMEOUT else state
-        if gone == states[reader.number] or gone == "opening":
+        if gone == states[reader.number] or gone == "opening" or (gone == "live" and reader.health.clock is None):
             continue
         if gone == "live":
             say(f"{name} is back; {_described(reader)}")

@@ -35,10 +35,12 @@ class SenderClock:
     Arguments:
         step: seconds by which two reports of a trusted clock may differ; half a frame of the rig.
         reports: whether the way over which pictures come has reports at all (RTSP); others go by arrival at once.
+        before: ``usual`` of the connection before; a first report that agrees with it is trusted as a second one.
     """
 
     step: float
     reports: bool = True
+    before: float | None = None
     kind: ClockKind | None = None
     restarts: int = 0
     _opened: float | None = None
@@ -65,6 +67,8 @@ class SenderClock:
                 return arrival
             return None
         self._agree(wall - stamp, report)
+        if self._reports == 1 and self.before is not None and abs(arrival - wall - self.before) < self.step:
+            self._reports = 2
         if self._reports < 2:
             self.kind = None
             return None
@@ -75,6 +79,11 @@ class SenderClock:
             return wall
         self.kind = "steadied"
         return wall + min(self._ways)
+
+    @property
+    def usual(self) -> float | None:
+        """Median seconds from a picture's time by the sender to its arrival here; None while none is known."""
+        return median(self._ways) if self._ways else self.before
 
     def _agree(self, tie: float, report: bool) -> None:
         """Count reports. Without network and load in it, a tie moves by a step of the clock alone."""

@@ -13,6 +13,7 @@ import av
 import av.error
 
 from gsstream_capture.clock import ClockKind, SenderClock, here
+from gsstream_capture.gathering import WHOLE, Gathering
 from gsstream_capture.pairing import Stamped
 from gsstream_capture.rig import CameraSpec, Opening, without_secrets
 
@@ -83,6 +84,7 @@ class CameraReader(threading.Thread):
         self._opening, self._deliver, self._step = opening, deliver, step
         self._by_clock, self._began = by_clock, began or here()
         self._halt = threading.Event()
+        self._clock: SenderClock | None = None  # of the connection that is, or was last
 
     def stop(self) -> None:
         """End as soon as the next packet or the time limit of reading allows."""
@@ -110,35 +112,39 @@ class CameraReader(threading.Thread):
             self.health.state = "silent"
 
     def _read(self) -> None:
-        opening, clock = self._opening, None
+        opening = self._opening
         with av.open(opening.target, format=opening.format, options=dict(opening.options), timeout=(OPEN, READ)) as box:
             stream = box.streams.video[0]
             stream.codec_context.thread_count = 1
             if opening.kind != "file":
                 stream.codec_context.options = {"flags": "low_delay"}
             self.health.opened += 1
-            clock = SenderClock(self._step, reports=self._by_clock and opening.kind == "rtsp")
+            before = None if self._clock is None else self._clock.usual
+            self._clock = SenderClock(self._step, self._by_clock and opening.kind == "rtsp", before)
             walls: dict[int | None, float | None] = {}
             reported, broken, sound = False, 0, False
+            pieced = opening.kind == "rtsp" and stream.codec_context.name not in WHOLE
+            gathering = Gathering(stream.codec_context.name) if pieced else None
             for packet in box.demux(stream):
                 if self._halt.is_set():
                     return
                 walls[packet.pts] = self._wall(packet)
                 reported = reported or bool(packet.get_sidedata("rtcp_sr"))
-                frames, fault = _decoded(packet)
-                if packet.is_keyframe and packet.size:
-                    sound = True
-                    self.health.keys.append(here())
-                if fault:
-                    # What is predicted from a damaged picture is damaged, until the next key picture.
-                    sound, broken = False, broken + 1
-                    self.health.damaged += 1
-                    if broken > MOST_DAMAGED:
-                        raise Damaged(f"{broken} pictures in turn could not be decoded")
-                for frame in frames if sound else ():
-                    broken = 0
-                    if self._take(frame, walls, clock, reported):
-                        reported = False
+                for picture, key, cut in _whole(packet, gathering):
+                    frames, fault = ([], True) if cut else _decoded(stream.codec_context, picture)
+                    if key or any(frame.key_frame for frame in frames):
+                        sound = True
+                        self.health.keys.append(here())
+                    if fault:
+                        # What is predicted from a damaged picture is damaged, until the next key picture.
+                        sound, broken = False, broken + 1
+                        self.health.damaged += 1
+                        if broken > MOST_DAMAGED:
+                            raise Damaged(f"{broken} pictures in turn could not be decoded")
+                    for frame in frames if sound else ():
+                        broken = 0
+                        if self._take(frame, walls, self._clock, reported):
+                            reported = False
                 if len(walls) > 64:
                     walls.clear()
 
@@ -182,10 +188,22 @@ class CameraReader(threading.Thread):
         return True
 
 
-def _decoded(packet: Any) -> tuple[list[Any], bool]:
-    """Return the sound pictures of a packet, and whether something in it was not."""
+def _whole(packet: Any, gathering: Gathering | None) -> list[tuple[Any, bool, bool]]:
+    """Pictures that are whole with a packet, each with whether a decoder can begin there, and whether it was cut."""
+    if gathering is None:
+        return [(packet, packet.is_keyframe and packet.size > 0, False)]
+    out = []
+    for one in gathering.push(bytes(packet), packet.pts):
+        picture = av.Packet(one.data)
+        picture.pts, picture.time_base = one.stamp, packet.time_base
+        out.append((picture, one.key, one.cut))
+    return out
+
+
+def _decoded(decoder: Any, packet: Any) -> tuple[list[Any], bool]:
+    """Return the sound frames of a picture, and whether something in it was not."""
     try:
-        frames = packet.decode()
+        frames = decoder.decode(packet)
     except av.error.InvalidDataError:
         return [], True
     sound = [frame for frame in frames if not frame.is_corrupt]

@@ -138,7 +138,9 @@ def opening_of(camera: CameraSpec, folder: Path, where: str) -> Opening:
         return Opening(str(folder / camera.url), kind="file")
     if scheme in ("rtsp", "rtsps"):
         # FFmpeg probes as much as it likes: with less, a camera under load failed with "Invalid data found".
-        return Opening(camera.url, None, {"rtsp_transport": camera.transport, "timeout": "3000000"}, "rtsp")
+        # Its parser holds a picture until the next one begins; gathering.py does not.
+        options = {"rtsp_transport": camera.transport, "timeout": "3000000", "fflags": "noparse+nofillin"}
+        return Opening(camera.url, None, options, "rtsp")
     if scheme in ("http", "https"):
         return Opening(camera.url, "mpjpeg", {"rw_timeout": "3000000"}, "http")
     if scheme == "v4l2":

@@ -10,17 +10,18 @@ from gsstream_capture.board.adjust import project
 from gsstream_capture.board.design import Board
 from gsstream_capture.board.start import matrix
 
-#: Pixels of the texture for a square.
-FINE = 64
-
 
 @cache
 def texture(board: Board, margin: float = 0.3):
-    """The board's picture with a white margin of so many squares, and the place of its first pixel, metres."""
-    size = (board.columns * FINE, board.rows * FINE)
-    drawn = board.made().generateImage(size, marginSize=0)
-    border = round(margin * FINE)
-    return cv2.copyMakeBorder(drawn, border, border, border, border, cv2.BORDER_CONSTANT, value=255), border
+    """The board's picture with a white margin of so many squares, how many pixels that is, and those of a square.
+
+    A square has as many as its markers' cells need to be whole: a print has no cell off by a rounding.
+    """
+    cells, share = board.made().getDictionary().markerSize + 2, board.marker_share
+    fine = next(n for n in range(50, 500) if n * share % cells == 0 and n * (1 - share) % 2 == 0)
+    drawn = board.made().generateImage((board.columns * fine, board.rows * fine), marginSize=0)
+    border = round(margin * fine)
+    return cv2.copyMakeBorder(drawn, border, border, border, border, cv2.BORDER_CONSTANT, value=255), border, fine
 
 
 @cache
@@ -36,17 +37,17 @@ def _rays(lens, size):
 
 def rendered(board: Board, lens, pose, size, draw, *, noise=2.0, blur=0.7):
     """[H, W] uint8 of a camera with ``lens`` [9] that sees the board at ``pose`` [4, 4], 2 x 2 samples a pixel."""
-    drawn, border = texture(board)
+    drawn, border, fine = texture(board)
     rays = _rays(tuple(lens), size) @ pose[:3, :3].astype(np.float32)  # in the board's axes
     eye = -pose[:3, :3].T @ pose[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         hit = eye + rays * (-eye[2] / rays[:, 2])[:, None]
-    per = FINE / (board.square_mm / 1000)
+    per = fine / (board.square_mm / 1000)
     shape = (2 * size[1], 2 * size[0])
     x = (hit[:, 0] * per + border - 0.5).reshape(shape).astype(np.float32)
     y = (hit[:, 1] * per + border - 0.5).reshape(shape).astype(np.float32)
-    fine = cv2.remap(drawn, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=90)
-    picture = cv2.resize(fine, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    sampled = cv2.remap(drawn, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=90)
+    picture = cv2.resize(sampled, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     picture = cv2.GaussianBlur(picture, (0, 0), blur)
     return np.uint8(np.clip(np.round(0.7 * picture + 20 + draw.normal(size=picture.shape) * noise), 0, 255))
 

@@ -57,8 +57,32 @@ def test_corners_are_where_they_are(more) -> None:
     found = Finder(board).find(255 - picture if board.inverted else picture)
     off = found.places - places_of(board, LENS, pose)[found.ids]
     assert len(found.ids) == 12
-    assert np.abs(off).max() < 0.25
-    assert np.abs(off.mean(0)).max() < 0.06, "pixels are counted from the corner of the picture"
+    assert np.abs(off).max() < 0.05
+    assert np.abs(off.mean(0)).max() < 0.02, "pixels are counted from the corner of the picture"
+
+
+@pytest.mark.parametrize("turn", [0.3, 0.6, 0.9])
+@pytest.mark.parametrize("blur", [0.4, 0.7, 0.9])
+def test_corners_of_a_tilted_board_are_where_they_are(turn, blur) -> None:
+    """The markers beside them are a few pixels away: OpenCV alone is up to 0.13 pixels off."""
+    draw = np.random.default_rng(1)
+    pose = facing(draw, [0.1, 0.05, 1.2], tilt=0.1, turn=turn)
+    found = Finder(BOARD).find(rendered(BOARD, LENS, pose, SIZE, draw, blur=blur))
+    off = found.places - places_of(BOARD, LENS, pose)[found.ids]
+    assert len(found.ids) >= 10
+    assert np.abs(off).max() < 0.06
+    assert np.sqrt((off**2).mean()) < 0.025
+
+
+def test_what_is_no_corner_is_left_out() -> None:
+    """Something bright lies on a corner and around it."""
+    pose = facing(np.random.default_rng(0), [0.02, 0.03, 0.9])
+    picture = rendered(BOARD, LENS, pose, SIZE, np.random.default_rng(0))
+    truth = places_of(BOARD, LENS, pose)
+    column, row = truth[5].astype(int)
+    picture[row - 12 : row + 12, column - 12 : column + 12] = 250
+    found = Finder(BOARD).find(picture)
+    assert np.abs(found.places - truth[found.ids]).max() < 0.3
 
 
 def test_a_board_on_glass_is_read_from_behind() -> None:

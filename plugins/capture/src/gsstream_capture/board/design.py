@@ -14,6 +14,7 @@ from ruamel.yaml.error import YAMLError
 
 from gsstream.core.errors import SourceError
 from gsstream.core.shapes import FloatArray, IntArray
+from gsstream_capture.board.corner import Drawn
 
 #: Corners of a board that a picture must show.
 FEWEST = 6
@@ -64,7 +65,7 @@ class Finder:
     def __init__(self, board: Board) -> None:
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-        self._board = board
+        self._board, self._drawn = board, Drawn(board.made())
         self._detector = cv2.aruco.CharucoDetector(board.made(), cv2.aruco.CharucoParameters(), parameters)
 
     def find(self, picture: Any) -> Sighting | None:
@@ -84,7 +85,11 @@ class Finder:
             return None
         numbers = np.asarray(ids).ravel().astype(np.int64)
         # OpenCV counts from the centre of the first pixel, this project from its corner.
-        places = np.asarray(corners, np.float64).reshape(-1, 2) + 0.5
+        near = np.asarray(corners, np.float64).reshape(-1, 2) + 0.5
+        places, good = self._drawn.refined(grey, self._board.points[numbers, :2], near)
+        if good.sum() < FEWEST:
+            return None
+        numbers, places = numbers[good], places[good]
         spread = np.linalg.svd(self._board.points[numbers, :2] - self._board.points[numbers, :2].mean(0))[1]
         if spread[1] < 0.5 * self._board.square_mm / 1000:
             return None

@@ -68,12 +68,21 @@ def test_a_disturbed_run_is_evaluated_on_what_it_saw(tmp_path: Path, capsys: pyt
     assert f"{mean:.2f}" in capsys.readouterr().out
 
 
+LEAKING: dict[str, Any] = {
+    "source": "synthetic:frames=2&views=3&width=64&height=48&supersample=1",
+    "first_frame__points": "sweep",
+    "stream__epochs": 1,
+}
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    return encode(tmp_path_factory.mktemp("honest"), **LEAKING)
+
+
 @pytest.mark.parametrize("leak", ["points", "training"])
-def test_leaks_change_the_stream_only_when_asked_for(tmp_path: Path, leak: str) -> None:
-    world = "synthetic:frames=2&views=3&width=64&height=48&supersample=1"
-    options = {"source": world, "first_frame__points": "sweep", "stream__epochs": 1}
-    honest = encode(tmp_path / "honest", **options)
-    assert encode(tmp_path / leak, data__leak=leak, **options) != honest
+def test_leaks_change_the_stream_only_when_asked_for(tmp_path: Path, honest: bytes, leak: str) -> None:
+    assert encode(tmp_path, data__leak=leak, **LEAKING) != honest
 
 
 def test_the_tuning_split_knows_nothing_of_the_test_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,7 +23,9 @@ def float_image(stored: torch.Tensor) -> torch.Tensor:
 
 def spread_to_pixels(tiles: torch.Tensor, height: int, width: int) -> torch.Tensor:
     """Return [height, width]: for every pixel the value of its tile, of ``tiles`` [ceil(H / 16), ceil(W / 16)]."""
-    return tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
+    rows, columns = tiles.shape
+    wide = tiles[:, None, :, None].expand(rows, TILE, columns, TILE)
+    return wide.reshape(rows * TILE, columns * TILE)[:height, :width]
 
 
 def check_tiles(tiles: torch.Tensor, size: tuple[int, int]) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 
@@ -186,12 +187,12 @@ class RenderSession(ABC):
         output = self.render(view, leaves, probe=probe, tile_mask=wanted)
         loss, upstream = _compared(output, target, wanted)
         exposure, image = target.exposure, output.image
+        curvature = None
+        if isinstance(wrt, WrtTransforms) and wrt.curvature:
+            curvature = _curvature(self, view, target, transforms=wrt.transforms, leaves=leaves, image=image)
         backward([image], [exposure.vjp(upstream) if exposure else upstream])
         by_exposure = exposure.grad(image.detach(), upstream) if exposure and wrt.exposure else None
         by_probe = None if probe is None else gradient_of(probe)
-        curvature = None
-        if isinstance(wrt, WrtTransforms) and wrt.curvature:
-            curvature = _curvature(self, view, target, transforms=wrt.transforms, leaves=leaves, wanted=wanted)
         return LossAndGrad(
             loss=loss, grad=wrt.grad(leaves), curvature=curvature, means2d=by_probe, exposure=by_exposure
         )
@@ -235,9 +236,9 @@ def _compared(
     image = output.image.detach()
     recorded = target.exposure.apply(image) if target.exposure else image
     loss, upstream = target.loss.evaluate(recorded, target.prepared, target.dssim, tiles)
-    # Else a pixel is NaN, or the image is so large that its square overflows.
+    # Else a pixel is NaN, or the image is so large that its square overflows. No loss is below 0.
     message = "image: expected finite values of ordinary size, got a loss that is not finite"
-    require(loss - loss == 0, lambda: ShapeError(message))
+    require(loss < math.inf, lambda: ShapeError(message))
     if target.tile_weights is not None:
         upstream = upstream * spread_to_pixels(target.tile_weights, *image.shape[:2])[..., None]
     return loss, upstream
@@ -249,14 +250,12 @@ def _curvature(
     target: ViewTarget,
     transforms: GroupTransforms[torch.Tensor],
     leaves: Gaussians[torch.Tensor],
-    wanted: torch.Tensor | None,
+    image: torch.Tensor,
 ) -> torch.Tensor:
-    """[K, 6, 6] of Gauss-Newton, from the share that each row has of a pixel's light."""
-    rows = leaves.map(torch.Tensor.detach)
-    colour = rows.sh0.clone().requires_grad_()
-    image = session.render(view, replace(rows, sh0=colour), tile_mask=wanted).image
+    """[K, 6, 6] of Gauss-Newton, from the share that each row has of a pixel's light. The image keeps its graph."""
     recorded = target.exposure.apply(image.detach()) if target.exposure else image.detach()
+    tensor = weighted_structure_tensor(recorded, float_image(target.image))
     # The gradient of a pixel by a colour is the share that its Gaussian has of the pixel's light.
-    backward([image], [weighted_structure_tensor(recorded, float_image(target.image))])
-    structure = gradient_of(colour)[:, 0] / SH0
-    return curvature_of(rows.means, transforms, session.cameras, camera=session.pinhole(view), structure=structure)
+    (share,) = torch.autograd.grad(image, leaves.sh0, tensor, retain_graph=True)
+    means, camera = leaves.means.detach(), session.pinhole(view)
+    return curvature_of(means, transforms, session.cameras, camera=camera, structure=share[:, 0] / SH0)

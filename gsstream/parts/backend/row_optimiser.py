@@ -12,6 +12,7 @@ from gsstream.core.gaussians import Gaussians
 from gsstream.parts.residual.adam_state import AdamState
 from gsstream.parts.residual.layout import JointLayout
 from gsstream.parts.residual.optimiser import ResidualOptimiser
+from gsstream.parts.residual.rate import rate_gradient
 from gsstream.parts.residual.reference import JointResidualOptimiser
 
 
@@ -42,6 +43,25 @@ class RowOptimiser(ABC):
                 changed then). On a GPU the gradient is looked at through ``gsstream.core.deferred``: the error may come
                 at the end of the pass, and the table is of no use then.
         """
+
+    def add_rate(
+        self,
+        gradient: torch.Tensor,
+        latents: torch.Tensor,
+        steps: torch.Tensor,
+        gates: torch.Tensor,
+        weight: float | torch.Tensor,
+    ) -> None:
+        """Add to ``gradient`` what the bits of a residual say (:func:`gsstream.parts.residual.rate.rate_gradient`).
+
+        This body is the truth; another gives the same numbers up to rounding.
+
+        Arguments:
+            gradient: [A, L] by the latents, changed in place. latents: [A, L].
+            steps: [L] latent units per symbol. gates: [A] in [0, 1]; rows at 0 cost nothing.
+            weight: loss per bit, above 0, a number or a tensor [].
+        """
+        gradient.add_(rate_gradient(latents, steps, gates, weight))
 
     def residual_optimiser(
         self, code: JointLayout, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor

@@ -42,7 +42,10 @@ class AdamState:
 
 
 class RowSteps(Protocol):
-    """What makes Adam steps on tables by name: :class:`gsstream.parts.backend.row_optimiser.RowOptimiser`."""
+    """What makes Adam steps on tables by name, and knows what bits cost.
+
+    It is :class:`gsstream.parts.backend.row_optimiser.RowOptimiser`.
+    """
 
     def step(
         self,
@@ -50,6 +53,15 @@ class RowSteps(Protocol):
         gradients: Mapping[str, torch.Tensor],
         states: Mapping[str, AdamState],
         lrs: Mapping[str, float | torch.Tensor],
+    ) -> None: ...
+
+    def add_rate(
+        self,
+        gradient: torch.Tensor,
+        latents: torch.Tensor,
+        steps: torch.Tensor,
+        gates: torch.Tensor,
+        weight: float | torch.Tensor,
     ) -> None: ...
 
 
@@ -86,7 +98,8 @@ class RowParameters:
             if leaf.grad is not None:
                 total[name] = total[name] + leaf.grad if name in total else leaf.grad
                 leaf.grad = None
-        lrs = {name: lr_factor * lr for name, lr in self._lrs.items()}
+        is_usual = isinstance(lr_factor, float) and lr_factor == 1  # of a tensor on a GPU nobody asks
+        lrs = self._lrs if is_usual else {name: lr_factor * lr for name, lr in self._lrs.items()}
         self._optimiser.step(self.leaves, total, self._states, lrs)
 
     def select_rows(self, rows: torch.Tensor) -> None:

@@ -10,11 +10,10 @@ from gsstream.parts.residual.adam_state import RowParameters, RowSteps
 from gsstream.parts.residual.decode import add_joint, decode_joint, join_features, joint_vjp
 from gsstream.parts.residual.layout import JointLayout
 from gsstream.parts.residual.optimiser import ResidualOptimiser
-from gsstream.parts.residual.rate import rate_gradient
 
 
 class JointResidualOptimiser(ResidualOptimiser[RenderSession]):
-    """Calls the map of latents to attributes, its gradient, the rate's gradient and the row optimiser's ``step``."""
+    """Calls the map of latents to attributes, its gradient, and the row optimiser's ``add_rate`` and ``step``."""
 
     def __init__(
         self,
@@ -24,7 +23,7 @@ class JointResidualOptimiser(ResidualOptimiser[RenderSession]):
         matrix: torch.Tensor,
         optimiser: RowSteps,
     ) -> None:
-        self._code, self._base, self._units = code, base, units
+        self._code, self._base, self._units, self._optimiser = code, base, units, optimiser
         self._features = join_features(code, base)
         start = base.means.new_zeros(len(base), code.width)
         self._latents = RowParameters({"latents": start}, {"latents": code.lrs}, optimiser)
@@ -56,7 +55,8 @@ class JointResidualOptimiser(ResidualOptimiser[RenderSession]):
         upstream = join_features(self._code, grad)
         back = joint_vjp(self._code, upstream, self._change, matrix=self.matrix, gates=self._gates, units=self._units)
         if isinstance(rd_lambda, torch.Tensor) or rd_lambda:
-            back.latents.add_(rate_gradient(self.latents.detach(), self._code.steps, self._gates, rd_lambda))
+            latents, steps = self.latents.detach(), self._code.steps
+            self._optimiser.add_rate(back.latents, latents, steps, gates=self._gates, weight=rd_lambda)
         self._grad = back
         return back.gates
 

@@ -11,6 +11,7 @@ from gsstream_gsplat_render.fused import Fused, FusedAdam, FusedLoss
 from gsstream_gsplat_render.kernels import Kernels
 from gsstream_gsplat_render.rig import Rigs
 from gsstream_gsplat_render.session import GsplatSession
+from gsstream_gsplat_render.tiles import IN_TORCH, TileKernels
 from torch_kernels import TORCH_FUSED, TORCH_KERNELS
 
 from gsstream.backend import Loss, RowOptimiser
@@ -21,7 +22,10 @@ from gsstream.testing import MethodUnderTest
 from gsstream.testing.pretend import DEVICE, PretendRecorder, kernel
 
 ON_DEVICE = Kernels(*(kernel(getattr(TORCH_KERNELS, field.name)) for field in fields(Kernels)))
-FUSED_THERE = Fused(*(kernel(getattr(TORCH_FUSED, field.name)) for field in fields(Fused)))
+TILES_THERE = TileKernels(*(kernel(getattr(IN_TORCH, field.name)) for field in fields(TileKernels)))
+FUSED_THERE = Fused(
+    *(kernel(getattr(TORCH_FUSED, field.name)) for field in fields(Fused) if field.name != "tiles"), tiles=TILES_THERE
+)
 CPU = torch.device("cpu")
 #: The stand-in's formulas give other last bits on the two devices with an older torch.
 SAME_BITS = pytest.mark.skipif(
@@ -30,7 +34,7 @@ SAME_BITS = pytest.mark.skipif(
 )
 
 
-RIGS = {"cpu": Rigs(CPU), "pretend": Rigs(DEVICE, PretendRecorder())}
+RIGS = {"cpu": Rigs(CPU), "pretend": Rigs(DEVICE, PretendRecorder(), TILES_THERE)}
 
 
 class StandIn(Renderer):

@@ -16,6 +16,7 @@ from torch_kernels import TORCH_FUSED
 
 from gsstream.parts.backend.reference import ReferenceRenderer
 from gsstream.parts.render.loss import ReferenceLoss
+from gsstream.parts.residual.rate import channel_spread, laplace_gradient
 from gsstream.testing import loss_and_change as loss_checks
 from gsstream.testing import optimiser as optimiser_checks
 
@@ -114,6 +115,29 @@ def test_a_table_is_moved_as_the_reference_moves_it(lr: str) -> None:
         assert torch.allclose(got, want, rtol=2e-6, atol=1e-7)
 
 
+@pytest.mark.parametrize("as_tensor", [False, True])
+@pytest.mark.parametrize("shape", [(1, 1), (300, 5), (1100, 16), (70, 67)])
+def test_the_rate_is_that_of_the_reference(shape: tuple[int, int], as_tensor: bool) -> None:
+    g = torch.Generator().manual_seed(shape[0])
+    # From symbols that are all zero to spreads of hundreds; ties, zeros and closed gates among them.
+    steps = 10 ** torch.empty(shape[1]).uniform_(-3, 1, generator=g)
+    symbols = torch.randn(shape, generator=g) * 10 ** torch.empty(shape[1]).uniform_(-4, 2.5, generator=g)
+    symbols[::7] = (2 * symbols[::7]).round() / 2
+    latents, gates = symbols * steps, torch.randint(0, 3, shape[:1], generator=g) / 2
+    weight: Any = torch.tensor(3e-4) if as_tensor else 3e-4
+    # In double precision but for the symbols, whose ties would be others there.
+    spread = channel_spread(latents, steps).double()
+    wanted = laplace_gradient(latents.double(), steps.double(), spread, weight) * (gates > 0)[:, None]
+    given = [value.to(DEVICE) for value in (latents, steps, gates)]
+    before = torch.randn(shape, generator=g)
+    found = before.clone().to(DEVICE)
+    FusedAdam(FUSED, None).add_rate(found, *given, weight.to(DEVICE) if as_tensor else weight)
+    error = (found.cpu() - before - wanted).abs()
+    # A sum with what was there before is rounded to its size.
+    assert bool((error <= 3e-4 * wanted.abs() + 3e-7 * before.abs() + 1e-9).all())
+    assert torch.equal(found.cpu()[gates == 0], before[gates == 0])
+
+
 def test_where_triton_cannot_compile_the_reference_is_used_with_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*_: Any) -> Any:
         raise RuntimeError("Python.h: No such file or directory")
@@ -155,11 +179,14 @@ import sys
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from gsstream_gsplat_render import adam, loss
+from gsstream_gsplat_render import adam, boxes, loss, rate
 
-KINDS = {"image": "*fp32", "target": "*u8", "tiles": "*u8", "steps": "*i32"}
-POINTERS = "weights sums grads out values gradients first second corrections rates".split()
-NUMBERS = "dssim scale rate slow slower".split()
+KINDS = {"target": "*u8", "tiles": "*u8", "steps": "*i32", "visible": "*u8", "table": "*u8", "places": "*i16"}
+KINDS |= dict.fromkeys("near ends most active".split(), "*i64")
+KINDS |= dict.fromkeys("radii boxes areas owners".split(), "*i32")
+POINTERS = "image weights sums grads out values gradients first second corrections rates".split()
+POINTERS += "means scales latents gates".split()
+NUMBERS = "dssim scale rate slow slower weight least ln2".split()
 
 def compiled(function, **constants):
     kinds = {**KINDS, **dict.fromkeys(POINTERS, "*fp32"), **dict.fromkeys(NUMBERS, "fp32")}
@@ -169,6 +196,9 @@ def compiled(function, **constants):
 
 found = [compiled(adam._move, as_table=True, block=512)]
 found += [compiled(kernel, as_bytes=True, all_tiles=False) for kernel in (loss._compare, loss._pull_back)]
+found += [compiled(boxes._find, side=16, block=256), compiled(boxes._cover, wide=32)]
+found += [compiled(rate._sum, rows=256, wide=16), compiled(rate._price, as_tensor=True, rows=256, wide=16)]
+found += [compiled(kernel, block=256) for kernel in (boxes._count, boxes._list)]
 assert all(code[:4] == b"\\x7fELF" for code in found)
 print(len(found))
 """
@@ -182,4 +212,4 @@ def test_the_kernels_compile_for_a_gpu_that_is_not_here(architecture: str, tmp_p
         [sys.executable, "-W", "ignore", "-c", COMPILE, architecture], env=environment, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split()[-1] == "3"
+    assert done.stdout.split()[-1] == "9"

@@ -17,7 +17,7 @@ import torch
 from gsstream_gsplat_render import kernels
 from gsstream_gsplat_render.kernels import Kernels, load_kernels
 from gsstream_gsplat_render.rig import Rigs
-from gsstream_gsplat_render.splat import draw
+from gsstream_gsplat_render.splat import composite, project
 from test_gsplat_renderer import rig, scene
 from torch_kernels import TORCH_KERNELS
 
@@ -134,6 +134,7 @@ def test_every_call_fits_the_signature_of_the_installed_gsplat() -> None:
         return call
 
     checked = Kernels(**{name: bound(name) for name in NAMES})
-    target = Rigs(torch.device("cpu")).find(rig(), (0.0, 0.0, 0.0))[0]
-    draw(checked, scene(), target, torch.zeros(len(scene()), 2), torch.ones(3, 4, dtype=torch.bool))
+    found = Rigs(torch.device("cpu")).find(rig(), (0.0, 0.0, 0.0))
+    seen = project(checked, scene(), found[0], found.grid, probe=torch.zeros(len(scene()), 2))
+    composite(checked, seen, found[0], found.grid.inside)
     assert called == set(NAMES)

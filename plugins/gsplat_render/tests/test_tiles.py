@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import dataclass
 
 import pytest
 import torch
 from gsplat.cuda._torch_impl import _isect_offset_encode, _isect_tiles
-from gsstream_gsplat_render.seen import Projected
-from gsstream_gsplat_render.tiles import TILE, Grid, boxes, covered_tiles, tile_lists
+from gsstream_gsplat_render.fused import load_fused
+from gsstream_gsplat_render.tiles import IN_TORCH, TILE, Grid, TileKernels, tile_lists
 
 KINDS = (
     "ordinary",
@@ -22,14 +23,35 @@ KINDS = (
     "undefined",
     "mixed",
 )
-CPU = torch.device("cpu")
+#: Those of torch, and those in Triton, on a GPU where there is one, else in Triton's interpreter.
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+FUSED = load_fused(DEVICE.type) if importlib.util.find_spec("triton") else None
+KERNELS = [pytest.param(IN_TORCH, id="torch")]
+KERNELS += [] if FUSED is None else [pytest.param(FUSED.tiles, id="triton")]
+
+
+@pytest.fixture(params=KERNELS)
+def kernels(request: pytest.FixtureRequest) -> TileKernels:
+    found: TileKernels = request.param
+    return found
 
 
 @dataclass(frozen=True)
 class Case:
-    seen: Projected
+    means2d: torch.Tensor
+    radii: torch.Tensor
+    depths: torch.Tensor
     rows: int
     columns: int
+
+    @property
+    def visible(self) -> torch.Tensor:
+        return (self.radii > 0).all(-1)
+
+    def boxes(self, grid: Grid) -> torch.Tensor:
+        found, visible = grid.boxes(self.means2d.to(DEVICE), self.radii.to(DEVICE))
+        assert torch.equal(visible.cpu(), self.visible)
+        return found
 
 
 def case(kind: str, seed: int) -> Case:
@@ -54,72 +76,75 @@ def case(kind: str, seed: int) -> Case:
     radii[hidden] = 0
     if kind in ("undefined", "mixed"):  # what gsplat leaves in rows that are not visible
         means[hidden], depths[hidden] = torch.tensor([float("nan"), float("-inf")]), float("nan")
-    rest = torch.zeros(number, 3), torch.zeros(number, 3), torch.zeros(number)
-    seen = Projected((radii > 0).all(-1), means, depths, *rest, radii)
-    return Case(seen, -(-height // TILE), -(-width // TILE))
+    return Case(means, radii, depths, -(-height // TILE), -(-width // TILE))
 
 
 def expected(case: Case) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Tile of each entry, rows, and where tiles begin; sorted stably, as the kernel sorts."""
-    seen, nothing = case.seen, torch.zeros(())
-    means, depths = seen.means2d.where(seen.visible[:, None], nothing), seen.depths.where(seen.visible, nothing + 1)
+    visible, nothing = case.visible, torch.zeros(())
+    means, depths = case.means2d.where(visible[:, None], nothing), case.depths.where(visible, nothing + 1)
     _, keys, order = _isect_tiles(
-        means[None], seen.radii[None], depths[None], TILE, case.columns, case.rows, sort=False
+        means[None], case.radii[None], depths[None], TILE, case.columns, case.rows, sort=False
     )
     keys, place = keys.sort(stable=True)
     return keys >> 32, order[place], _isect_offset_encode(keys, 1, case.columns, case.rows)[0]
 
 
-@pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("kind", KINDS)
-def test_lists_are_those_of_gsplat(kind: str, seed: int) -> None:
-    given = case(kind, seed)
+def test_lists_are_those_of_gsplat(kind: str, kernels: TileKernels) -> None:
+    for seed in range(6 if kernels is IN_TORCH or DEVICE.type == "cuda" else 1):  # the interpreter is slow
+        compare(case(kind, seed), kernels)
+
+
+def compare(given: Case, kernels: TileKernels) -> None:
     _, order, offsets = expected(given)
     number = len(order)
     for capacity in (number + 37, max(1, number)):
-        grid = Grid(given.rows, given.columns, capacity, CPU)
-        found = tile_lists(given.seen, boxes(given.seen, grid), grid)
-        assert bool(found.fits)
+        grid = Grid(given.rows, given.columns, capacity, DEVICE, kernels)
+        found = tile_lists(given.depths.to(DEVICE), given.boxes(grid), grid)
         assert int(grid.most) == number
-        assert torch.equal(found.order[:number], order)
-        assert torch.equal(found.offsets[: given.rows], offsets)
+        assert torch.equal(found.order[:number].cpu(), order)
+        assert torch.equal(found.offsets[: given.rows].cpu(), offsets)
         # What is left belongs to the row of tiles below the picture, and names rows that exist.
         assert int(found.offsets[given.rows, 0]) == number
         assert int(found.order.min()) >= 0
-        assert int(found.order.max()) < len(given.seen.depths)
+        assert int(found.order.max()) < len(given.depths)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("empty", "off-screen")])
-def test_a_list_that_is_too_short_says_so(kind: str) -> None:
+def test_a_list_that_is_too_short_says_so_and_is_empty(kind: str, kernels: TileKernels) -> None:
     given = case(kind, 1)
     number = len(expected(given)[1])
     assert number > 1
-    grid = Grid(given.rows, given.columns, number // 2, CPU)
-    found = tile_lists(given.seen, boxes(given.seen, grid), grid)
-    assert not bool(found.fits)
+    grid = Grid(given.rows, given.columns, number // 2, DEVICE, kernels)
+    found = tile_lists(given.depths.to(DEVICE), given.boxes(grid), grid)
     assert int(grid.most) == number
-    assert 0 <= int(found.order.min()) <= int(found.order.max()) < len(given.seen.depths)
+    assert not found.offsets[: given.rows].any()
+    assert not found.offsets[given.rows, 0]
+    assert 0 <= int(found.order.min()) <= int(found.order.max()) < len(given.depths)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_tiles_that_rows_cover_are_those_of_their_entries(kind: str) -> None:
+def test_tiles_that_rows_cover_are_those_of_their_entries(kind: str, kernels: TileKernels) -> None:
     given = case(kind, 2)
     tile, order, _ = expected(given)
-    active = torch.rand(len(given.seen.depths), generator=torch.Generator().manual_seed(3)) < 0.1
+    active = torch.rand(len(given.depths), generator=torch.Generator().manual_seed(3)) < 0.1
     hits = torch.zeros(given.rows * given.columns).index_add_(0, tile, active[order.long()].float())
-    grid = Grid(given.rows, given.columns, 1, CPU)
-    rows = active.nonzero()[:, 0]
-    found = covered_tiles(boxes(given.seen, grid)[rows], given.seen.visible[rows], grid)
-    assert torch.equal(found, hits.reshape(given.rows, given.columns) > 0)
+    grid = Grid(given.rows, given.columns, 1, DEVICE, kernels)
+    rows, boxes = active.nonzero()[:, 0].to(DEVICE), given.boxes(grid)
+    found = grid.covered(boxes, rows)
+    assert torch.equal(found[: given.rows].cpu(), hits.reshape(given.rows, given.columns) > 0)
+    before = torch.zeros_like(found)
+    before[0, -1] = True
+    assert torch.equal(grid.covered(boxes, rows, before), found | before)
+    assert not found[given.rows].any()
 
 
-def test_many_tiles_are_counted_in_32_bits() -> None:
-    grid = Grid(300, 200, 64, CPU)
+def test_many_tiles_are_counted_in_32_bits(kernels: TileKernels) -> None:
+    grid = Grid(300, 200, 64, DEVICE, kernels)
     assert grid.bounds.dtype == torch.int32
     means, radii = torch.tensor([[3190.0, 4790.0], [8.0, 8.0]]), torch.full((2, 2), 4, dtype=torch.int32)
-    rest = torch.zeros(2, 3), torch.zeros(2, 3), torch.zeros(2)
-    seen = Projected(torch.ones(2, dtype=torch.bool), means, torch.tensor([1.0, 2.0]), *rest, radii)
-    found = tile_lists(seen, boxes(seen, grid), grid)
+    found = tile_lists(torch.tensor([1.0, 2.0]).to(DEVICE), grid.boxes(means.to(DEVICE), radii.to(DEVICE))[0], grid)
     assert found.order[:2].tolist() == [1, 0]
     assert found.offsets[0, :2].tolist() == [0, 1]
     assert int(found.offsets[299, 199]) == 1

@@ -13,10 +13,12 @@ import torch
 from gsplat.cuda import _torch_impl as gsplat
 from gsstream_gsplat_render.fused import Fused
 from gsstream_gsplat_render.kernels import Kernels
+from gsstream_gsplat_render.tiles import IN_TORCH
 
 from gsstream.parts.backend.adam import ReferenceAdam
 from gsstream.parts.render.loss import ReferenceLoss, _windowed, ssim_and_grads
 from gsstream.parts.residual.adam_state import AdamState
+from gsstream.parts.residual.rate import MIN_SPREAD, laplace_gradient
 
 NAN = float("nan")
 
@@ -206,4 +208,20 @@ def move_table(
     ReferenceAdam().move(value, gradient, state, corrections, lr=lr)
 
 
-TORCH_FUSED = Fused(loss_by_tile, gradient_by_pixel, move_table)
+def sum_symbols(latents: torch.Tensor, steps: torch.Tensor) -> torch.Tensor:
+    return torch.round(latents / steps).abs().sum(0, keepdim=True)
+
+
+def add_rate(
+    gradient: torch.Tensor,
+    latents: torch.Tensor,
+    steps: torch.Tensor,
+    gates: torch.Tensor,
+    sums: torch.Tensor,
+    weight: float | torch.Tensor,
+) -> None:
+    spread = (sums.sum(0) / len(latents)).clamp_min(MIN_SPREAD)
+    gradient.add_(laplace_gradient(latents, steps, spread, weight) * (gates > 0)[:, None])
+
+
+TORCH_FUSED = Fused(loss_by_tile, gradient_by_pixel, move_table, sum_symbols, add_rate, tiles=IN_TORCH)

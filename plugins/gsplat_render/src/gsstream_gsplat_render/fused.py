@@ -1,7 +1,7 @@
-"""The loss and the row optimiser of a GPU, a kernel or two each where torch takes dozens of operations.
+"""What a GPU computes in a kernel or two where torch takes dozens of operations: loss, row optimiser, lists of tiles.
 
-The kernels are written in Triton, which torch's CUDA builds for Linux bring. Without it loss and optimiser are those of
-the reference, in torch on the GPU: the same numbers up to rounding, from more launches.
+The kernels are written in Triton, which torch's CUDA builds for Linux bring. Without it everything is in torch on the
+GPU: the same numbers up to rounding, from more launches.
 """
 
 from __future__ import annotations
@@ -17,15 +17,19 @@ import torch
 
 from gsstream.backend import AdamState, Loss
 from gsstream.replay import Recorder, ReplayedAdam
+from gsstream_gsplat_render.tiles import Grid, TileKernels, tile_lists
 
 
 @dataclass(frozen=True, slots=True)
 class Fused:
-    """Functions of one launch each, with the signatures of ``loss.py`` and ``adam.py``."""
+    """Functions of one launch each, with the signatures of ``loss.py``, ``adam.py``, ``rate.py``, ``tiles.py``."""
 
     loss_by_tile: Callable[..., Any]
     gradient_by_pixel: Callable[..., Any]
     move_table: Callable[..., Any]
+    sum_symbols: Callable[..., Any]
+    add_rate: Callable[..., Any]
+    tiles: TileKernels
 
 
 @functools.cache
@@ -36,8 +40,10 @@ def load_fused(device: str) -> Fused | None:
     """
     if importlib.util.find_spec("triton") is None:
         return None
+    from gsstream_gsplat_render import boxes
     from gsstream_gsplat_render.adam import move_table
     from gsstream_gsplat_render.loss import gradient_by_pixel, loss_by_tile
+    from gsstream_gsplat_render.rate import add_rate, sum_symbols
 
     image, mask = torch.zeros(16, 16, 3, device=device), torch.ones(1, 1, dtype=torch.bool, device=device)
     steps, corrections = torch.ones(1, dtype=torch.int32, device=device), torch.ones(2, 2, device=device)
@@ -47,14 +53,29 @@ def load_fused(device: str) -> Fused | None:
             gradient_by_pixel(image, image.byte(), by_window, 0.2, tiles)
         for lr in (0.1, image[0, 0]):
             move_table(image[0, :1], image[1, :1], image[2, :1], image[3, :1], steps, corrections, lr)
+            sums = sum_symbols(image[5], corrections.flatten()[:3])
+            add_rate(image[4], image[5], corrections.flatten()[:3], image[6, :, 0], sums, lr)
+        tiles = TileKernels(boxes.find_boxes, boxes.count_entries, boxes.list_entries, boxes.cover_tiles)
+        _try_tiles(tiles, torch.device(device))
     except Exception as error:  # compilers and drivers of strangers fail in any way
         warnings.warn(
-            f"loss and Adam run in torch's own operations, because Triton's kernels do not run on {device} "
-            f"({type(error).__name__}: {error}). Triton needs a C compiler and Python's headers (Debian: python3-dev)",
+            "loss, Adam, rate and lists of tiles run in torch's own operations, because Triton's kernels do not run on "
+            f"{device} ({type(error).__name__}: {error}). Triton needs a C compiler and Python's headers (Debian: "
+            "python3-dev)",
             stacklevel=2,
         )
         return None
-    return Fused(loss_by_tile, gradient_by_pixel, move_table)
+    return Fused(loss_by_tile, gradient_by_pixel, move_table, sum_symbols=sum_symbols, add_rate=add_rate, tiles=tiles)
+
+
+def _try_tiles(kernels: TileKernels, device: torch.device) -> None:
+    """Make lists of one Gaussian."""
+    grid = Grid(1, 1, capacity=1, device=device, kernels=kernels)
+    means2d, radii = torch.full((1, 2), 8.0, device=device), torch.ones(1, 2, dtype=torch.int32, device=device)
+    found, _ = grid.boxes(means2d, radii)
+    rows = torch.zeros(1, dtype=torch.int64, device=device)
+    tile_lists(rows.float(), found, grid)
+    grid.covered(found, rows)
 
 
 @final
@@ -82,7 +103,7 @@ class FusedLoss(Loss):
 
 @final
 class FusedAdam(ReplayedAdam):
-    """Recorded and replayed as its base is; a table is moved by one kernel.
+    """Recorded and replayed as its base is; a table is moved by one kernel, and two find what bits cost.
 
     Arguments:
         recorder: of the device; None: nothing is recorded.
@@ -102,3 +123,15 @@ class FusedAdam(ReplayedAdam):
     ) -> None:
         moments = (state.exp_avg, state.exp_avg_sq, state.steps)
         self._fused.move_table(value, gradient, *moments, corrections, lr)
+
+    def add_rate(
+        self,
+        gradient: torch.Tensor,
+        latents: torch.Tensor,
+        steps: torch.Tensor,
+        gates: torch.Tensor,
+        weight: float | torch.Tensor,
+    ) -> None:
+        if latents.numel():
+            sums = self._fused.sum_symbols(latents, steps)
+            self._fused.add_rate(gradient, latents, steps, gates, sums, weight)

@@ -9,7 +9,8 @@ import torch
 
 from gsstream.api import Cameras
 from gsstream.replay import Recorder, Records, recorder_on
-from gsstream_gsplat_render.tiles import TILE, Grid
+from gsstream_gsplat_render.fused import load_fused
+from gsstream_gsplat_render.tiles import IN_TORCH, TILE, Grid, TileKernels
 
 Background = tuple[float, float, float]
 #: Entries of the lists of tiles: room beyond what was seen, and the unit in which lists grow.
@@ -22,12 +23,13 @@ KEPT = 8
 class Target:
     """A camera and its background on the device.
 
-    ``viewmat`` [1, 4, 4], ``K`` [1, 3, 3], ``background`` [1, 3], all float32.
+    ``viewmat`` [1, 4, 4], ``K`` [1, 3, 3], ``background`` [1, 3], ``centre`` [3] of the camera, all float32.
     """
 
     viewmat: torch.Tensor
     K: torch.Tensor
     background: torch.Tensor
+    centre: torch.Tensor
     width: int
     height: int
     near: float
@@ -51,25 +53,29 @@ class Rig:
     """
 
     def __init__(
-        self, cameras: Cameras, background: Background, device: torch.device, recorder: Recorder | None
+        self,
+        cameras: Cameras,
+        background: Background,
+        device: torch.device,
+        recorder: Recorder | None,
+        kernels: TileKernels,
     ) -> None:
-        self.cameras, self.background, self.device = cameras, background, device
+        self.cameras, self.background, self.device, self._kernels = cameras, background, device, kernels
         self._targets: dict[int, Target] = {}
         self._numbers: dict[int, torch.Tensor] = {}
         self.recorder = recorder
         #: Of scenes of which every row changes; those of a narrowed one are its session's.
         self.records = None if recorder is None else Records(recorder, room=self)
-        self._entries, self._grid = 0, Grid(*tiles_of(cameras), capacity=LEAST, device=device)
+        self._entries, self._grid = 0, self._grid_of(LEAST)
 
     def __getitem__(self, view: int) -> Target:
         if view not in self._targets:
             cameras = self.cameras
-            viewmat, K, background = (
-                torch.as_tensor(value, dtype=torch.float32).to(self.device)
-                for value in (cameras.viewmats[view], cameras.Ks[view], self.background)
-            )
+            viewmat = torch.as_tensor(cameras.viewmats[view], dtype=torch.float32)
+            centre = -(viewmat[:3, :3].T @ viewmat[:3, 3])
+            known = viewmat[None], torch.as_tensor(cameras.Ks[view])[None], torch.tensor([self.background]), centre
             size = cameras.width, cameras.height, cameras.near_plane
-            self._targets[view] = Target(viewmat[None], K[None], background[None], *size)
+            self._targets[view] = Target(*(value.float().to(self.device) for value in known), *size)
         return self._targets[view]
 
     def numbers(self, view: int) -> torch.Tensor:
@@ -84,9 +90,11 @@ class Rig:
     def grid(self) -> Grid:
         """What lists of tiles need; it has room for half as many entries again as were ever seen."""
         if self._entries > self._grid.capacity / ROOM:
-            capacity = -(-int(self._entries * ROOM**2) // LEAST) * LEAST
-            self._grid = Grid(*tiles_of(self.cameras), capacity=capacity, device=self.device)
+            self._grid = self._grid_of(-(-int(self._entries * ROOM**2) // LEAST) * LEAST)
         return self._grid
+
+    def _grid_of(self, capacity: int) -> Grid:
+        return Grid(*tiles_of(self.cameras), capacity=capacity, device=self.device, kernels=self._kernels)
 
     def count(self, entries: int) -> None:
         """Take note of how many entries a view needed."""
@@ -107,11 +115,11 @@ class Rig:
 class Rigs:
     """The rigs that were drawn last on a device, so that one that is drawn again is not copied again.
 
-    ``recorder``: of the device; None: nothing is recorded there.
+    ``recorder``: of the device; None: nothing is recorded there. ``kernels``: that sort into tiles.
     """
 
-    def __init__(self, device: torch.device, recorder: Recorder | None = None) -> None:
-        self.device, self.recorder = device, recorder
+    def __init__(self, device: torch.device, recorder: Recorder | None = None, kernels: TileKernels = IN_TORCH) -> None:
+        self.device, self.recorder, self.kernels = device, recorder, kernels
         self._last: list[Rig] = []
 
     def find(self, cameras: Cameras, background: Background) -> Rig:
@@ -119,7 +127,8 @@ class Rigs:
         for rig in self._last:
             if rig.background == background and (rig.cameras is cameras or _same(rig.cameras, cameras)):
                 return rig
-        self._last = [Rig(cameras, background, self.device, self.recorder), *self._last[: KEPT - 1]]
+        made = Rig(cameras, background, self.device, recorder=self.recorder, kernels=self.kernels)
+        self._last = [made, *self._last[: KEPT - 1]]
         return self._last[0]
 
 
@@ -133,4 +142,5 @@ def _same(one: Cameras, other: Cameras) -> bool:
 def rigs_on(device: str) -> Rigs:
     """Return the rigs of a device; all renderers that work on it share them."""
     place = torch.empty(0, device=device).device  # with its number, as tensors that lie there have it
-    return Rigs(place, recorder_on(place))
+    fused = load_fused(device)
+    return Rigs(place, recorder_on(place), IN_TORCH if fused is None else fused.tiles)

@@ -18,3 +18,4 @@ class Projected:
     colors: torch.Tensor  # [N, 3]
     opacities: torch.Tensor  # [N]
     radii: torch.Tensor  # [N, 2] int32, half the sides of the box in which it is drawn, pixels
+    boxes: torch.Tensor  # [N, 4] int32, that box in tiles, as of ``tiles.find_boxes``

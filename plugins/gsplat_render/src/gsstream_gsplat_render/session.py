@@ -14,12 +14,15 @@ from gsstream.replay import RecordError, Records, ReplayedSession, SeenView
 from gsstream_gsplat_render.kernels import Kernels
 from gsstream_gsplat_render.rig import Background, Rig, Rigs, Target
 from gsstream_gsplat_render.seen import Projected
-from gsstream_gsplat_render.splat import Drawn, composite, composite_fixed, draw, pixels, project
-from gsstream_gsplat_render.tiles import Grid, boxes, covered_tiles
+from gsstream_gsplat_render.splat import Drawn, Pasted, composite, composite_fixed, draw, pixels, project
+from gsstream_gsplat_render.tiles import Grid
 
 
 class Shown(NamedTuple):
-    """A view of the session's scene: image [H, W, 3], alpha [H, W]. ``tiles``: in which the active rows are drawn."""
+    """A view of the session's scene: image [H, W, 3], alpha [H, W].
+
+    ``tiles``: in which the active rows are drawn, as ``Grid.covered`` gives them.
+    """
 
     image: torch.Tensor
     alpha: torch.Tensor
@@ -91,29 +94,32 @@ class GsplatSession(ReplayedSession):
     ) -> RenderOutput:
         home, (target, shown, grid) = rows.means.device, self.own(view)
         whole, whole_probe = self._merged(_moved(rows, self._rigs.device), probe)
-        mask = None if tile_mask is None else _checked_mask(tile_mask, target).to(self._rigs.device)
+        mask = None if tile_mask is None else grid.padded(_checked_mask(tile_mask, target).to(self._rigs.device))
         if len(whole) == 0:
-            drawn = draw(self._kernels, whole, target)
+            drawn = draw(self._kernels, whole, target, grid)
             return RenderOutput(drawn.image.to(home), drawn.alpha.to(home))
-        seen = project(self._kernels, whole, target, whole_probe)
-        edges = boxes(seen, grid)
+        seen = project(self._kernels, whole, target, grid, probe=whole_probe)
         if shown is None:
-            drawn = self._composited(seen, edges, target, mask=mask)
-            return RenderOutput(drawn.image.to(home), drawn.alpha.to(home))
+            drawn = self._composited(seen, target, mask)
+            alpha = drawn.alpha
+            if mask is not None and self.fixed is None:
+                alpha = torch.where(pixels(mask, target), alpha, torch.zeros_like(alpha))
+            return RenderOutput(drawn.image.to(home), alpha.to(home))
         assert self._active is not None
-        tiles = shown.tiles | covered_tiles(edges[self._active], seen.visible[self._active], grid)
+        tiles = grid.covered(seen.boxes, self._active, shown.tiles)
         mask = tiles if mask is None else tiles & mask
-        drawn, inside = self._composited(seen, edges, target, mask=mask), pixels(mask, target)
-        image = torch.where(inside[..., None], drawn.image, shown.image)
-        alpha = torch.where(inside, drawn.alpha, shown.alpha)
-        return RenderOutput(image.to(home), alpha.to(home), tiles.to(home))
+        drawn, inside = self._composited(seen, target, mask), pixels(mask, target)
+        image: torch.Tensor = Pasted.apply(drawn.image, shown.image, inside)  # type: ignore[no-untyped-call]
+        # What is recorded is a loss, which reads no alpha.
+        alpha = drawn.alpha if self.fixed is not None else torch.where(inside, drawn.alpha, shown.alpha)
+        return RenderOutput(image.to(home), alpha.to(home), tiles[:-1].to(home))
 
     def visible(self, view: int, tiles: torch.Tensor) -> torch.Tensor:
-        target = self._rig[view]
+        target, grid = self._rig[view], self._rig.grid
         size = self._cameras.height, self._cameras.width
 
         def shown(scene: Gaussians[torch.Tensor]) -> RenderOutput:
-            drawn = draw(self._kernels, scene, target)
+            drawn = draw(self._kernels, scene, target, grid)
             return RenderOutput(drawn.image, drawn.alpha)
 
         return drawn_rows(shown, self._scene, size, tiles.to(self._rigs.device)).to(self._home)
@@ -154,12 +160,12 @@ class GsplatSession(ReplayedSession):
         (target, upstream, grid), rig = asked, self._rigs.find(self._cameras, (0.0, 0.0, 0.0))
         probe = torch.zeros_like(self._scene.means[:, :2]).requires_grad_()
         with torch.enable_grad():
-            seen = project(self._kernels, self._scene, target, probe)
+            seen = project(self._kernels, self._scene, target, grid or rig.grid, probe=probe)
             if grid is None:
                 drawn = composite(self._kernels, seen, target)
                 rig.count(drawn.entries)
             else:
-                drawn = composite_fixed(self._kernels, seen, target, grid, edges=boxes(seen, grid))
+                drawn = composite_fixed(self._kernels, seen, target, grid)
             (gradient,) = torch.autograd.grad(drawn.image, probe, upstream)
         return ScreenGradient(gradient, seen.visible)
 
@@ -189,12 +195,10 @@ class GsplatSession(ReplayedSession):
         drawing.fixed = seen
         return drawing
 
-    def _composited(
-        self, seen: Projected, edges: torch.Tensor, target: Target, mask: torch.Tensor | None = None
-    ) -> Drawn:
+    def _composited(self, seen: Projected, target: Target, mask: torch.Tensor | None = None) -> Drawn:
         """A view, with lists of fixed size where that is what is recorded."""
         if self.fixed is not None:
-            return composite_fixed(self._kernels, seen, target, self.fixed.own.grid, edges=edges, mask=mask)
+            return composite_fixed(self._kernels, seen, target, self.fixed.own.grid, mask=mask)
         drawn = composite(self._kernels, seen, target, mask)
         self._rig.count(drawn.entries)
         return drawn
@@ -222,11 +226,10 @@ class GsplatSession(ReplayedSession):
         if view not in self._tiles:
             target, grid = self._rig[view], self._rig.grid
             with torch.no_grad():
-                seen = project(self._kernels, self._scene, target)
-                edges = boxes(seen, grid)
+                seen = project(self._kernels, self._scene, target, grid)
                 if view not in self._pictures:
-                    self._pictures[view] = self._composited(seen, edges, target)
-                self._tiles[view] = covered_tiles(edges[self._active], seen.visible[self._active], grid)
+                    self._pictures[view] = self._composited(seen, target)
+                self._tiles[view] = grid.covered(seen.boxes, self._active)
         drawn = self._pictures[view]
         return Shown(drawn.image, drawn.alpha, self._tiles[view])
 

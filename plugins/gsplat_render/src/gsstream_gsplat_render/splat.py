@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -18,7 +19,10 @@ FAR = 1e10
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """Image [H, W, 3] and alpha [H, W] on the device; differentiable. ``entries``: of the lists of tiles."""
+    """Image [H, W, 3] and alpha [H, W] on the device; differentiable. ``entries``: of the lists of tiles.
+
+    Where a mask leaves tiles out, the image is the background there, and alpha is what was in the memory before.
+    """
 
     image: torch.Tensor
     alpha: torch.Tensor
@@ -26,7 +30,7 @@ class Drawn:
 
 
 def project(
-    kernels: Kernels, gaussians: Gaussians[torch.Tensor], view: Target, probe: torch.Tensor | None = None
+    kernels: Kernels, gaussians: Gaussians[torch.Tensor], view: Target, grid: Grid, probe: torch.Tensor | None = None
 ) -> Projected:
     """Project raw Gaussians [N], N > 0, that are on the device already; ``probe`` [N, 2] is added to the 2-D means."""
     opacities = gaussians.opacities.sigmoid()
@@ -47,43 +51,48 @@ def project(
         calc_compensations=False,
         opacities=opacities,
     )
-    visible = (radii > 0).all(-1)
     if probe is not None:
         means2d = means2d + probe[None]
-    colors = _colors(kernels, gaussians, view, visible)
+    boxes, visible = grid.boxes(means2d.squeeze(0), radii.squeeze(0))
+    colors = _colors(kernels, gaussians, view, visible[None])
     # Squeezed and not indexed: the gradient of a view is a view, that of an index is a copy.
     return Projected(
-        visible=visible.squeeze(0),
+        visible=visible,
         means2d=means2d.squeeze(0),
         depths=depths.squeeze(0),
         conics=conics.squeeze(0),
         colors=colors.squeeze(0),
         opacities=opacities,
         radii=radii.squeeze(0),
+        boxes=boxes,
     )
 
 
 def composite(kernels: Kernels, seen: Projected, view: Target, mask: torch.Tensor | None = None) -> Drawn:
-    """Composite what was projected; with a mask [tile rows, tile columns] in its tiles, else show the background."""
+    """Composite what was projected; with a mask [tile rows + 1, tile columns] in its tiles, else show the background.
+
+    The last row of the mask is not looked at.
+    """
     rows, columns = view.tiles
     means2d, radii, depths = seen.means2d[None], seen.radii[None], seen.depths[None]
     _, keys, order = kernels.tiles(means2d, radii, depths, TILE, columns, rows, packed=False, n_images=1)
     offsets = kernels.offsets(keys, 1, columns, rows).reshape(rows, columns)
-    image, alpha = _rasterized(kernels, seen, view, offsets=offsets, order=order, mask=mask)
-    return _shown(image, alpha, mask, view, entries=len(order))
+    wanted = None if mask is None else mask[:rows]
+    image, alpha = _rasterized(kernels, seen, view, offsets=offsets, order=order, mask=wanted)
+    return Drawn(image, alpha, entries=len(order))
 
 
 def composite_fixed(
-    kernels: Kernels, seen: Projected, view: Target, grid: Grid, edges: torch.Tensor, mask: torch.Tensor | None = None
+    kernels: Kernels, seen: Projected, view: Target, grid: Grid, mask: torch.Tensor | None = None
 ) -> Drawn:
     """Composite with lists of fixed size (:mod:`gsstream_gsplat_render.tiles`); nothing is waited for.
 
-    Where the lists are too short, nothing is drawn, so no gradient is wrong, and the grid remembers it.
+    The last row of the mask is False. Where the lists are too short, nothing is drawn, so no gradient is wrong, and the
+    grid remembers it.
     """
-    lists = tile_lists(seen, edges, grid)
-    wanted = grid.inside if mask is None else torch.cat([mask, grid.outside])
-    image, alpha = _rasterized(kernels, seen, view, offsets=lists.offsets, order=lists.order, mask=wanted & lists.fits)
-    return _shown(image, alpha, mask, view, entries=grid.capacity)
+    lists, wanted = tile_lists(seen.depths, seen.boxes, grid), grid.inside if mask is None else mask
+    image, alpha = _rasterized(kernels, seen, view, offsets=lists.offsets, order=lists.order, mask=wanted)
+    return Drawn(image, alpha, entries=grid.capacity)
 
 
 def _rasterized(
@@ -111,40 +120,42 @@ def _rasterized(
     return image.squeeze(0), alpha.squeeze((0, 3))
 
 
-def _shown(image: torch.Tensor, alpha: torch.Tensor, mask: torch.Tensor | None, view: Target, entries: int) -> Drawn:
-    if mask is not None:
-        # gsplat 1.5 writes the background into masked tiles but leaves their alpha as the memory was.
-        alpha = torch.where(pixels(mask, view), alpha, torch.zeros_like(alpha))
-    return Drawn(image, alpha, entries)
-
-
-def draw(
-    kernels: Kernels,
-    gaussians: Gaussians[torch.Tensor],
-    view: Target,
-    probe: torch.Tensor | None = None,
-    mask: torch.Tensor | None = None,
-) -> Drawn:
+def draw(kernels: Kernels, gaussians: Gaussians[torch.Tensor], view: Target, grid: Grid) -> Drawn:
     """Draw raw Gaussians [N] that are on the device already."""
     if len(gaussians) == 0:
         return _empty(view)
-    return composite(kernels, project(kernels, gaussians, view, probe), view, mask)
+    return composite(kernels, project(kernels, gaussians, view, grid), view)
 
 
 def pixels(mask: torch.Tensor, view: Target) -> torch.Tensor:
-    """A tile mask [rows, columns] as a pixel mask [H, W]."""
-    wide = mask.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)
+    """A tile mask [rows + 1, columns] as a pixel mask [H, W]."""
+    rows, columns = mask.shape
+    wide = mask[:, None, :, None].expand(rows, TILE, columns, TILE).reshape(rows * TILE, columns * TILE)
     return wide[: view.height, : view.width]
+
+
+class Pasted(torch.autograd.Function):
+    """Drawn pixels [H, W, 3] where ``inside`` [H, W], others elsewhere.
+
+    The gradient is handed on as it is: in masked tiles the rasteriser does not look at it.
+    """
+
+    @staticmethod
+    def forward(_ctx: Any, drawn: torch.Tensor, others: torch.Tensor, inside: torch.Tensor) -> torch.Tensor:
+        return torch.where(inside[..., None], drawn, others)
+
+    @staticmethod
+    def backward(_ctx: Any, *upstream: torch.Tensor) -> tuple[torch.Tensor, None, None]:
+        return upstream[0], None, None
 
 
 def _colors(kernels: Kernels, gaussians: Gaussians[torch.Tensor], view: Target, visible: torch.Tensor) -> torch.Tensor:
     """[1, N, 3] colours max(0, 0.5 + harmonics), seen from the camera."""
-    viewmat = view.viewmat[0]
-    center = -(viewmat[:3, :3].T @ viewmat[:3, 3])
     coefficients = torch.cat([gaussians.sh0, gaussians.shN], 1)
-    directions = gaussians.means - center
+    directions = gaussians.means - view.centre
     harmonics = kernels.harmonics(gaussians.sh_degree, directions[None], coefficients[None], masks=visible)
-    return torch.clamp_min(harmonics + 0.5, 0.0)
+    # clamp_min(0), whose gradient takes three operations: no sum with 0.5 lies between this bound and 0.
+    return torch.nn.functional.threshold(harmonics + 0.5, -torch.finfo(torch.float32).tiny, 0.0)
 
 
 def _empty(view: Target) -> Drawn:

@@ -6,6 +6,7 @@ import importlib
 import importlib.metadata
 import inspect
 import os
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +16,7 @@ import gsplat
 import pytest
 import torch
 from gsstream_gsplat_render import kernels
-from gsstream_gsplat_render.kernels import Kernels, load_kernels
+from gsstream_gsplat_render.kernels import Kernels, keep_whole, load_kernels
 from gsstream_gsplat_render.rig import Rigs
 from gsstream_gsplat_render.splat import composite, project
 from test_gsplat_renderer import rig, scene
@@ -57,9 +58,9 @@ def with_functions(monkeypatch: pytest.MonkeyPatch, harmonics: Any) -> None:
 
 
 def install_nvcc(root: Path) -> Path:
-    """Wheels as NVIDIA lays them out: nvcc, and the runtime under its full name alone."""
+    """Wheels as NVIDIA lays them out: nvcc, headers, and the runtime under its full name alone."""
     home = root / "nvidia" / "cu13"
-    for path in ("bin/nvcc", "lib/libcudart.so.13"):
+    for path in ("bin/nvcc", "include/cuda_runtime.h", "lib/libcudart.so.13"):
         (home / path).parent.mkdir(parents=True, exist_ok=True)
         (home / path).touch()
     return home
@@ -79,6 +80,36 @@ def test_all_well(machine: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.Ca
     link = Path(os.environ["LIBRARY_PATH"]) / "libcudart.so"
     assert link.resolve() == home / "lib" / "libcudart.so.13"
     assert not torch.backends.cudnn.allow_tf32
+
+
+BACKENDS = torch.backends
+SETTINGS: dict[str, Any] = {
+    "nothing": lambda: None,
+    "the older interface": lambda: setattr(BACKENDS.cudnn, "allow_tf32", True),
+    "the newer one, for convolutions": lambda: setattr(BACKENDS.cudnn.conv, "fp32_precision", "tf32"),
+    "the newer one, for all of torch": lambda: setattr(BACKENDS, "fp32_precision", "tf32"),
+    "products of matrices": lambda: torch.set_float32_matmul_precision("high"),
+}
+
+
+@pytest.fixture
+def precision() -> Iterator[None]:
+    yield
+    for owner in (BACKENDS, BACKENDS.cudnn, BACKENDS.cuda.matmul):
+        owner.fp32_precision = "none"
+    BACKENDS.cudnn.allow_tf32, BACKENDS.cuda.matmul.allow_tf32 = True, False
+
+
+@pytest.mark.usefixtures("precision")
+@pytest.mark.parametrize("before", SETTINGS)
+def test_no_bits_are_left_out_whatever_was_set_before_and_through_either_interface(before: str) -> None:
+    SETTINGS[before]()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        keep_whole()
+        assert not BACKENDS.cudnn.allow_tf32
+        assert not BACKENDS.cuda.matmul.allow_tf32
+        assert BACKENDS.cudnn.conv.fp32_precision == BACKENDS.cuda.matmul.fp32_precision == "ieee"
 
 
 @pytest.mark.parametrize("version", ["1.6.0", "1.5.2", "2.0"])
@@ -101,12 +132,38 @@ def test_no_nvcc(machine: pytest.MonkeyPatch) -> None:
 
 
 def test_an_nvcc_that_fails(machine: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    nvcc = tmp_path / "nvcc"
-    nvcc.write_text("#!/bin/sh\nexit 1\n")
-    nvcc.chmod(0o755)
+    nvcc = install_on_path(machine, tmp_path / "own")
     with_functions(machine, refused)
     with pytest.raises(PluginUnavailable, match=rf"do not run, though there is {nvcc} .*VERBOSE=1 python"):
         load_kernels("cuda")
+
+
+def install_on_path(machine: pytest.MonkeyPatch, home: Path) -> Path:
+    """An nvcc of the system that fails, with headers beside it."""
+    nvcc, header = home / "bin" / "nvcc", home / "targets" / "x86_64-linux" / "include" / "cuda_runtime.h"
+    for path in (nvcc, header):
+        path.parent.mkdir(parents=True)
+    header.touch()
+    nvcc.write_text("#!/bin/sh\nexit 1\n")
+    nvcc.chmod(0o755)
+    machine.setenv("PATH", str(nvcc.parent))
+    return nvcc
+
+
+def test_an_nvcc_without_headers_is_passed_over(machine: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    own = install_on_path(machine, tmp_path / "own")
+    assert kernels.find_toolkit() == own
+    link = tmp_path / "elsewhere" / "bin" / "nvcc"
+    link.parent.mkdir(parents=True)
+    link.symlink_to(own)
+    machine.setenv("PATH", str(link.parent))
+    assert kernels.find_toolkit() == link, "the headers lie beside what it is a link to"
+    next(own.parents[1].rglob("cuda_runtime.h")).unlink()
+    assert kernels.find_toolkit() is None
+    home = install_nvcc(tmp_path)
+    assert kernels.find_toolkit() == home / "bin" / "nvcc"
+    machine.setenv("CUDA_HOME", str(own.parents[1]))
+    assert kernels.find_toolkit() is None
 
 
 def test_a_toolkit_of_the_users_own_is_left_as_it_is(machine: pytest.MonkeyPatch, tmp_path: Path) -> None:

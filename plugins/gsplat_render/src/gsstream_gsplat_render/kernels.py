@@ -80,9 +80,20 @@ def load_kernels(device: str) -> Kernels:
         torch.cuda.synchronize(device)
     except Exception as error:  # compiling or loading a foreign extension can fail in any way
         raise PluginUnavailable(_why_not(error, str(nvcc) if nvcc else None)) from error
-    # Convolutions would round to 10 bits, and SSIM subtracts squares that are nearly equal.
-    torch.backends.cudnn.allow_tf32 = False
+    keep_whole()
     return kernels
+
+
+def keep_whole() -> None:
+    """Have convolutions and products of matrices keep all 23 bits of a float32.
+
+    With 10 bits (TF32) SSIM subtracts squares that are nearly equal, and a residual is not what its packet decodes to.
+    Torch has two interfaces for this. The older one does nothing where the newer one was set for all of torch, and
+    reading the older raises an error where the two disagree: so both are set, the newer one last.
+    """
+    torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
+    for operation in (torch.backends.cudnn.conv, torch.backends.cudnn.rnn, torch.backends.cuda.matmul):
+        operation.fp32_precision = "ieee"
 
 
 def gsplat_version() -> str | None:
@@ -109,7 +120,8 @@ def _why_not(error: Exception, nvcc: str | None) -> str:
     said = f"({type(error).__name__}: {error})"
     if nvcc is None:
         return (
-            f"renderer 'gsplat': gsplat's CUDA kernels are not compiled, and no nvcc was found {said}; "
+            "renderer 'gsplat': gsplat's CUDA kernels are not compiled, and no nvcc was found with CUDA's headers beside "
+            f"it {said}; "
             f"{INSTALL_NVCC} (of the CUDA that torch is built for: {torch.version.cuda}), {DECLINE}"
         )
     return (

@@ -18,6 +18,8 @@ def find_toolkit(
 ) -> Path | None:
     """Return the nvcc that gsplat will compile with, and set CUDA_HOME where it came by wheels; None without any.
 
+    An nvcc without CUDA's headers beside it compiles nothing: it is passed over.
+
     Arguments:
         environment: a user's own CUDA_HOME, or nvcc on the PATH, is left as it is.
         packages: where wheels are installed; default: those of this interpreter.
@@ -27,16 +29,23 @@ def find_toolkit(
     home = environment.get("CUDA_HOME") or environment.get("CUDA_PATH")
     if home:
         nvcc = Path(home) / "bin" / "nvcc"
-        return nvcc if nvcc.is_file() else None
+        return nvcc if nvcc.is_file() and _has_headers(nvcc) else None
     on_path = shutil.which("nvcc", path=environment.get("PATH", ""))
-    if on_path:
+    if on_path and _has_headers(Path(on_path)):
         return Path(on_path)
     root = (packages or Path(sysconfig.get_path("purelib"))) / "nvidia"
-    for nvcc in sorted(root.glob("cu*/bin/nvcc"), reverse=True):
+    for nvcc in filter(_has_headers, sorted(root.glob("cu*/bin/nvcc"), reverse=True)):
         environment["CUDA_HOME"] = str(nvcc.parents[1])
         _link_runtime(nvcc.parents[1], environment, links)
         return nvcc
     return None
+
+
+def _has_headers(nvcc: Path) -> bool:
+    """Whether the headers of CUDA's runtime lie where this nvcc, or the one that it is a link to, looks for them."""
+    homes = {place.parent.parent for place in (nvcc, nvcc.resolve())}
+    folders = [folder for home in homes for folder in (home / "include", *home.glob("targets/*/include"))]
+    return any((folder / "cuda_runtime.h").is_file() for folder in folders)
 
 
 def _link_runtime(home: Path, environment: MutableMapping[str, str], links: Path | None) -> None:

@@ -55,8 +55,8 @@ def load_fused(device: str) -> Fused | None:
             move_table(image[0, :1], image[1, :1], image[2, :1], image[3, :1], steps, corrections, lr)
             sums = sum_symbols(image[5], corrections.flatten()[:3])
             add_rate(image[4], image[5], corrections.flatten()[:3], image[6, :, 0], sums, lr)
-        tiles = TileKernels(boxes.find_boxes, boxes.count_entries, boxes.list_entries, boxes.cover_tiles)
-        _try_tiles(tiles, torch.device(device))
+        lists = TileKernels(boxes.find_boxes, boxes.count_entries, boxes.list_entries, boxes.cover_tiles)
+        _try_tiles(lists, torch.device(device))
     except Exception as error:  # compilers and drivers of strangers fail in any way
         warnings.warn(
             "loss, Adam, rate and lists of tiles run in torch's own operations, because Triton's kernels do not run on "
@@ -65,7 +65,7 @@ def load_fused(device: str) -> Fused | None:
             stacklevel=2,
         )
         return None
-    return Fused(loss_by_tile, gradient_by_pixel, move_table, sum_symbols=sum_symbols, add_rate=add_rate, tiles=tiles)
+    return Fused(loss_by_tile, gradient_by_pixel, move_table, sum_symbols=sum_symbols, add_rate=add_rate, tiles=lists)
 
 
 def _try_tiles(kernels: TileKernels, device: torch.device) -> None:

@@ -120,8 +120,8 @@ def _why_not(error: Exception, nvcc: str | None) -> str:
     said = f"({type(error).__name__}: {error})"
     if nvcc is None:
         return (
-            "renderer 'gsplat': gsplat's CUDA kernels are not compiled, and no nvcc was found with CUDA's headers beside "
-            f"it {said}; "
+            "renderer 'gsplat': gsplat's CUDA kernels are not compiled, and no nvcc was found with CUDA's headers "
+            f"beside it {said}; "
             f"{INSTALL_NVCC} (of the CUDA that torch is built for: {torch.version.cuda}), {DECLINE}"
         )
     return (

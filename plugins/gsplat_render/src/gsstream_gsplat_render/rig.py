@@ -73,9 +73,15 @@ class Rig:
             cameras = self.cameras
             viewmat = torch.as_tensor(cameras.viewmats[view], dtype=torch.float32)
             centre = -(viewmat[:3, :3].T @ viewmat[:3, 3])
-            known = viewmat[None], torch.as_tensor(cameras.Ks[view])[None], torch.tensor([self.background]), centre
-            size = cameras.width, cameras.height, cameras.near_plane
-            self._targets[view] = Target(*(value.float().to(self.device) for value in known), *size)
+            self._targets[view] = Target(
+                viewmat=viewmat[None].to(self.device),
+                K=torch.as_tensor(cameras.Ks[view], dtype=torch.float32)[None].to(self.device),
+                background=torch.tensor([self.background], dtype=torch.float32).to(self.device),
+                centre=centre.to(self.device),
+                width=cameras.width,
+                height=cameras.height,
+                near=cameras.near_plane,
+            )
         return self._targets[view]
 
     def numbers(self, view: int) -> torch.Tensor:

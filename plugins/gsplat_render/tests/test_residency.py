@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 import torch
 from gsstream_gsplat_render.fused import FusedLoss
+from gsstream_gsplat_render.session import GsplatSession, Own
 from resident import CPU, DEVICE, SAME_BITS, method_on
 
 from gsstream.core.errors import ComponentError
@@ -31,6 +32,8 @@ from gsstream.testing.pretend import PretendDevice
 pytestmark = pytest.mark.skipif(
     torch.cuda.is_available(), reason="needs a process in which torch sees no GPU: set CUDA_VISIBLE_DEVICES= (empty)"
 )
+#: Large enough that some rows leave, and some tiles are touched by none of those that stay.
+LARGER = "synthetic:frames=4&views=3&width=64&height=48&supersample=1"
 COUNTS = Path(__file__).parents[3] / "docs" / "results" / "data" / "gpu.jsonl"
 
 
@@ -141,10 +144,10 @@ def test_a_later_frame_and_its_motion_stay_there_and_packets_are_those_of_the_pr
             iterations = next(marks for name, marks in calls.items() if name.startswith("iterations"))
             *exact, launches = between(iterations)[-1]
             assert tuple(exact) == RESIDENT, (log.up, log.down, log.waits)
-            assert launches <= on_the_page("one iteration of a later frame")["launches"]
+            assert launches <= on_the_page("one iteration of a later frame, all rows")["launches"]
             for name, row in (
-                ("iterations", "one iteration of a later frame"),
-                ("gradients by", "one iteration of motion"),
+                ("iterations", "one iteration of a later frame, all rows"),
+                ("gradients by", "one iteration of motion, all rows"),
             ):
                 most = max(size for kind, size in sizes.items() if kind.startswith(name))
                 assert 0 < most <= on_the_page(row)["operations"], (name, sizes)
@@ -153,6 +156,37 @@ def test_a_later_frame_and_its_motion_stay_there_and_packets_are_those_of_the_pr
             packets.append(step.packet.data)
     assert packets == packets_of(frames)
     assert len(set(packets)) == len(frames)
+
+
+def test_the_counts_of_a_narrowed_session_and_of_what_a_view_needs_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows leave after a pass: what is left of them is drawn into pictures of the others, which are made once."""
+    source = open_source(LARGER)
+    first, later = source.frame(0), source.frame(1)
+    with PretendDevice() as log:
+        method = method_on(DEVICE)
+        settings = method.assembly.recipe.stream.model_copy(update={"epochs": 2})
+        recipe = method.assembly.recipe.model_copy(update={"stream": settings})
+        method.assembly = replace(method.assembly, recipe=recipe)
+        step = method.begin(first)
+        _, sizes = replayed(log, monkeypatch)
+        drawn, own = [], GsplatSession.own
+
+        def counted_own(self: GsplatSession, view: int) -> Own:
+            before, is_first = log.launches, self.fixed is None and view not in self._tiles
+            found = own(self, view)
+            if is_first and found.shown is not None:
+                drawn.append(log.launches - before)
+            return found
+
+        monkeypatch.setattr(GsplatSession, "own", counted_own)
+        method.step(step.state, later)
+    assert drawn, "no row has left"
+    narrowed, motion = (
+        on_the_page(f"one iteration of {what}, narrowed")["operations"] for what in ("a later frame", "motion")
+    )
+    assert max(size for name, size in sizes.items() if name.startswith("iterations")) <= narrowed, sizes
+    assert max(size for name, size in sizes.items() if name.startswith("gradients by WrtTransforms")) <= motion, sizes
+    assert narrowed + max(drawn) <= on_the_page("the same, of a view that is drawn for the first time")["operations"]
 
 
 @SAME_BITS

@@ -91,8 +91,10 @@ def keep_whole() -> None:
     Torch has two interfaces for this. The older one does nothing where the newer one was set for all of torch, and
     reading the older raises an error where the two disagree: so both are set, the newer one last.
     """
-    torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
-    for operation in (torch.backends.cudnn.conv, torch.backends.cudnn.rnn, torch.backends.cuda.matmul):
+    cudnn: Any = torch.backends.cudnn
+    matmul: Any = torch.backends.cuda.matmul
+    cudnn.allow_tf32 = matmul.allow_tf32 = False
+    for operation in (cudnn.conv, cudnn.rnn, matmul):
         operation.fp32_precision = "ieee"
 
 

@@ -37,7 +37,7 @@ _KEYS = Keys(
 )
 _CAMERA_KEYS = Keys(
     read="id split width height K w2c frames distortion fisheye",
-    idle="colmap_name photometric notes",
+    idle="colmap_name photometric gain notes",
     refused="camera_model is_fisheye dist skew k1 k2 k3 k4 k5 k6 p1 p2",
 )
 

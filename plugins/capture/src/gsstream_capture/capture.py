@@ -14,6 +14,7 @@ import numpy as np
 from gsstream.core.errors import InputError, SourceError, suggest
 from gsstream.input.recordings.calibration import CALIBRATION_FILE, Calibration, read_calibration
 from gsstream_capture.clock import here
+from gsstream_capture.exposure import matched
 from gsstream_capture.folder import FULL, LOW, FolderWriter
 from gsstream_capture.pairing import Instant, Pairing, Stamped
 from gsstream_capture.pictures import CameraPlan, jpeg, pixels_of, planned, upright_size
@@ -168,8 +169,12 @@ def run_capture(
         raise InputError(f"{out} is not empty; expected a new folder, choose another --out")
     with LiveRig(rig, folder) as live:
         say(f"waiting for {len(rig.cameras)} cameras")
-        instant: Instant | None = live.first()
+        instant = live.first()
         plans = plans_of(live, calibration, path)
+        if rig.exposure == "match" and calibration is not None:
+            first = [instant.pictures[number].frame for number in range(len(plans))]
+            seen = [plan.apply(pixels_of(frame, plan.rotate)) for frame, plan in zip(first, plans, strict=True)]
+            plans = matched(seen, plans, say)
         more = None if calibration is None else {"name": calibration.name, "licence": calibration.licence}
         writer = FolderWriter(out, plans, rig.fps, more=more)
         say("; ".join(f"{r.spec.id}: {_described(r)}" for r in live.readers))

@@ -18,7 +18,7 @@ from gsstream.input.prepare.findings import Finding
 from gsstream.input.prepare.picture_checks import Thumbnails
 from gsstream.input.prepare.sync_checks import check_sync
 from gsstream_capture.capture import CLOCKS, LiveRig, Say, calibration_of, plans_of
-from gsstream_capture.exposure import gains
+from gsstream_capture.exposure import gains, percents
 from gsstream_capture.folder import claim
 from gsstream_capture.pairing import Offset
 from gsstream_capture.pictures import CameraPlan, jpeg, pixels_of
@@ -123,8 +123,5 @@ def _exposure(found: Any, plans: list[CameraPlan]) -> list[str]:
         if np.isnan(gain).any():
             lines.append(f"exposure of {plan.name}: not known (too few points that others see, too)")
         elif np.abs(gain - 1).max() > EXPOSURE:
-            listed = ", ".join(
-                f"{name} {100 * (g - 1):+.0f} %" for name, g in zip(("blue", "green", "red"), gain, strict=True)
-            )
-            lines.append(f"exposure of {plan.name}: {listed}; set exposure and white balance to manual")
+            lines.append(f"exposure of {plan.name}: {percents(gain)}; set exposure and white balance to manual")
     return lines or ["exposures agree within 3 %"]

@@ -1,13 +1,15 @@
-"""How differently cameras expose: what two of them see of the same points, without correcting anything."""
+"""How differently cameras expose, by what two see of the same points; corrected only where a rig asks for it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
 import cv2
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from gsstream.core.shapes import FloatArray
 from gsstream_capture.pictures import CameraPlan
@@ -23,7 +25,8 @@ DARK, BRIGHT = 12, 243
 def gains(pictures: Sequence[Any], plans: Sequence[CameraPlan]) -> FloatArray:
     """Return [C, 3] the gain of each camera against the middle of all, by channel (blue, green, red).
 
-    ``pictures`` [H, W, 3] uint8 are straight and of one instant. NaN where a camera shares too few points with others.
+    ``pictures`` [H, W, 3] uint8 are straight and of one instant. NaN where a camera shares too few points with others,
+    and for all but the largest group of cameras that share points.
     """
     sift = cv2.SIFT_create(2000)  # type: ignore[attr-defined]
     found = [sift.detectAndCompute(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), None) for picture in pictures]
@@ -39,13 +42,37 @@ def gains(pictures: Sequence[Any], plans: Sequence[CameraPlan]) -> FloatArray:
     out = np.full((len(pictures), 3), np.nan)
     if not rows:
         return out
-    steps = np.zeros((len(rows), len(pictures)))
+    steps, links = np.zeros((len(rows), len(pictures))), np.eye(len(pictures))
     for row, (a, b) in enumerate(rows):
-        steps[row, a], steps[row, b] = -1, 1
-    known = sorted({camera for pair in rows for camera in pair})
-    logs = np.linalg.lstsq(steps[:, known], np.stack(ratios), rcond=None)[0]
+        steps[row, a], steps[row, b], links[a, b] = -1, 1, 1
+    # Two groups of cameras that share nothing say nothing of each other: the larger one counts.
+    group = connected_components(links, directed=False)[1]
+    known = np.flatnonzero(group == np.bincount(group).argmax())
+    inside = np.isin([a for a, _ in rows], known)
+    logs = np.linalg.lstsq(steps[inside][:, known], np.stack(ratios)[inside], rcond=None)[0]
     out[known] = np.exp(logs - np.median(logs, axis=0))
     return out
+
+
+def matched(pictures: Sequence[Any], plans: Sequence[CameraPlan], say: Callable[[str], None]) -> list[CameraPlan]:
+    """Return plans that divide each camera's colours by its gain; who shares too little is told, and left as it is.
+
+    ``pictures`` as for :func:`gains`, written by these plans.
+    """
+    out = []
+    for plan, gain in zip(plans, gains(pictures, plans), strict=True):
+        if np.isnan(gain).any():
+            say(f"exposure of {plan.name} is not matched: too few points that others see, too")
+            out.append(plan)
+            continue
+        say(f"exposure of {plan.name} is matched: it was {percents(gain)} beside the others")
+        out.append(replace(plan, gain=(float(gain[0]), float(gain[1]), float(gain[2]))))
+    return out
+
+
+def percents(gain: FloatArray) -> str:
+    """Return a gain by channel, as a difference."""
+    return ", ".join(f"{name} {100 * (g - 1):+.0f} %" for name, g in zip(("blue", "green", "red"), gain, strict=True))
 
 
 def _matches(one: Any, two: Any, first: CameraPlan, second: CameraPlan) -> tuple[FloatArray, FloatArray]:

@@ -43,6 +43,7 @@ class FolderWriter:
                 "w2c": plan.w2c.tolist(),
                 "frames": f"{plan.name}/%06d.jpg",
                 "split": plan.split,
+                **({} if plan.gain is None else {"gain": [round(part, 5) for part in reversed(plan.gain)]}),
             }
             for plan in self._plans
         ]

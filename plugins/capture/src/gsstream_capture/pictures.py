@@ -28,9 +28,17 @@ class CameraPlan:
     split: str
     rotate: int = 0
     straight: Undistortion | None = None
+    gain: tuple[float, float, float] | None = None  # blue, green, red, which what is written is divided by
 
     def apply(self, pixels: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
         """Return [H, W, 3] uint8 as it is written, of upright pixels as they came."""
+        out = self._straightened(pixels)
+        if self.gain is None:
+            return out
+        levels = np.clip(np.round(np.arange(256)[:, None] / np.array(self.gain)), 0, 255).astype(np.uint8)
+        return np.asarray(cv2.LUT(out, levels[None]))
+
+    def _straightened(self, pixels: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
         if self.straight is None:
             return pixels
         if pixels.shape[1::-1] != self.straight.size:

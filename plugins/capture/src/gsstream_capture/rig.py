@@ -61,6 +61,9 @@ class Rig(BaseModel):
     clock: Literal["capture", "arrival"] = Field(
         default="capture", description="pair by the cameras' own clocks where they tell them, or by arrival"
     )
+    exposure: Literal["as_it_is", "match"] = Field(
+        default="as_it_is", description="'match' divides each camera's colours by its gain in the first instant"
+    )
     quality: int = Field(default=95, ge=50, le=100, description="of the JPEG pictures")
 
 

@@ -25,7 +25,19 @@ from tools.drill import GSSTREAM
 
 ROOT = Path(__file__).parents[1]
 #: Frames that the page shows before its picture is taken, and seconds that they may take.
-FRAMES, PATIENCE = 20, 600.0
+FRAMES, PATIENCE = 60, 600.0
+#: Keep when the pixels of a frame could be read back from the graphics: until then nobody sees it.
+FINISH = """(() => {
+  const player = PLAYER;
+  player.finished = [];
+  const shown = player.shown.bind(player);
+  player.shown = () => {
+    shown();
+    const { gl } = player.renderer;
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+    player.finished.push([player.frame, Date.now()]);
+  };
+})()"""
 
 
 def checked(rig: Path, out: Path) -> dict[str, Any]:
@@ -44,8 +56,8 @@ def shown(rig: Path, out: Path, size: tuple[int, int], test: str) -> dict[str, A
         test: the camera from whose place the page shows the scene first.
 
     Returns the frame that the page showed, how far its picture is from the camera's of that instant, and how late
-    frames were: from their files to packets, and until the page had drawn them. Raises GsstreamError when the run
-    ends before that.
+    frames were: from their exposure to files, packets, and pixels in the page. Raises GsstreamError when the run ends
+    before that.
     """
     sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "packet"), str(ROOT / "tests" / "web")]
     from browser_runs import MESSAGE, PLAYER
@@ -62,12 +74,14 @@ def shown(rig: Path, out: Path, size: tuple[int, int], test: str) -> dict[str, A
         try:
             _wait_for(out / "run" / METRICS, process)
             page.go(f"http://127.0.0.1:{port}")
+            page.until(f"{PLAYER}?.latency", PATIENCE)
+            page.evaluate(FINISH.replace("PLAYER", PLAYER))
             page.until(f"{PLAYER}?.latency?.frames.length >= {FRAMES}", PATIENCE)
             page.evaluate(f"{PLAYER}.pause()")
             time.sleep(1.0)
             frame = page.evaluate(f"{PLAYER}.frame")
             page.screenshot(str(out / "browser.png"))
-            late, said = page.evaluate(f"[{PLAYER}.latency.frames, {MESSAGE}]")
+            late, finished, said = page.evaluate(f"[{PLAYER}.latency.frames, {PLAYER}.finished, {MESSAGE}]")
         finally:
             process.terminate()
             process.wait()
@@ -76,18 +90,32 @@ def shown(rig: Path, out: Path, size: tuple[int, int], test: str) -> dict[str, A
         "page_said": [said, *page.messages],
         "frame": frame,
         "page_against_camera_db": round(_psnr(out / "browser.png", seen), 2),
-        **_latencies(out, late),
-        "load": os.getloadavg()[0],
+        **_latencies(out, late, finished),
+        "load": round(os.getloadavg()[0], 1),
     }
 
 
-def _latencies(out: Path, late: Sequence[dict[str, float]]) -> dict[str, Any]:
+def _latencies(out: Path, late: Sequence[dict[str, float]], finished: Sequence[Sequence[float]]) -> dict[str, Any]:
+    """Medians over the encoded frames that the page drew, milliseconds; all clocks are this machine's."""
+    exposed = {line["frame"]: 1000 * line["time"] for line in read_lines(out / "capture" / "capture.jsonl")}
     lines = [line for line in read_lines(out / "run" / METRICS)[1:] if line["live"]["policy"] is None]
-    return {
-        "frames_measured": len(late),
-        "file_to_packet_ms": round(1000 * median(line["live"]["latency_seconds"] for line in lines)),
-        "packet_to_drawn_ms": round(median(entry["drawn"] for entry in late)),
+    steps = {line["frame"]: 1000 * sum(line["seconds"].values()) for line in lines}
+    there: dict[int, float] = {}
+    for frame, when in finished:
+        there.setdefault(int(frame), when)
+    rows = [(int(entry["frame"]), entry) for entry in late if entry["frame"] in there and entry["frame"] in steps]
+    written = {line["frame"]: line["written_ms"] for line in read_lines(out / "capture" / "capture.jsonl")}
+    times = {
+        "exposure_to_file_ms": [written[frame] for frame, _ in rows],
+        "frame_step_ms": [steps[frame] for frame, _ in rows],
+        "exposure_to_packet_ms": [entry["written"] - exposed[frame] for frame, entry in rows],
+        "packet_to_page_ms": [entry["came"] for _, entry in rows],
+        "packet_to_drawn_ms": [entry["drawn"] for _, entry in rows],
+        "exposure_to_pixels_ms": [there[frame] - exposed[frame] for frame, _ in rows],
     }
+    if not rows:
+        return {"frames_measured": 0}
+    return {"frames_measured": len(rows), **{name: round(median(values)) for name, values in times.items()}}
 
 
 def _wait_for(path: Path, process: subprocess.Popen[Any]) -> None:

@@ -107,7 +107,7 @@ def films(folder: Path, demo, late: int) -> Path:
     shutil.copy(DEMO_FOLDER / "cameras.json", folder / "cameras.json")
     order = [*range(len(frames)), *range(len(frames) - 2, 0, -1)] * 4
     for c, plan in enumerate(plans):
-        shift = late if c == 6 else 0
+        shift = late if c == 2 else 0
         shown = (frames[order[max(0, i - shift)], c] for i in range(60))
         encoded(folder / plan.name, shown, 10, suffix="mp4")
     return rig_file(folder, {plan.name: f"{plan.name}.mp4" for plan in plans}, 10)

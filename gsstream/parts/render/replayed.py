@@ -72,10 +72,8 @@ class ReplayedSession(RenderSession):
         return super().loss_and_grad(view, target, wrt)
 
     def pinhole(self, view: int) -> Pinhole:
-        if self.fixed is None:
-            return super().pinhole(view)
-        numbers = self.fixed.pinhole.unbind()
-        return Pinhole((numbers[:3], numbers[3:6], numbers[6:9]), numbers[9:12], numbers[12:])
+        numbers = self.numbers(view) if self.fixed is None else self.fixed.pinhole
+        return Pinhole(numbers[:9].reshape(3, 3), numbers[9:12], numbers[12:])
 
     def _compared(self, asked: _Asked) -> LossAndGrad[Any]:
         return self.drawing(asked.seen).loss_and_grad(0, asked.seen.target, asked.wrt)

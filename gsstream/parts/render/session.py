@@ -220,7 +220,7 @@ class RenderSession(ABC):
         )
 
     def pinhole(self, view: int) -> Pinhole:
-        """Return a camera as numbers; a session on a device may give tensors [] that are there already."""
+        """Return a camera; a session on a device may give tensors that are there already."""
         return Pinhole.of(self.cameras, view)
 
     def cache_bytes(self) -> RenderCache:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
@@ -25,10 +26,35 @@ def transform_rows(base: Gaussians[torch.Tensor], transforms: GroupTransforms[to
     # axis * tan(angle / 2) is the vector part of the quaternion, in units of the scalar part.
     turn = torch.cat([torch.ones_like(center[:, :1]), transforms.rotation], 1)
     turn = turn / turn.norm(dim=1, keepdim=True)
+    to_matrix, to_product = _quadratic_forms(center.device)
+    matrices = (_products(turn, turn) @ to_matrix).reshape(-1, 3, 3)
     arm = (base.means.double() - center[group])[..., None]
-    means = (rotation_matrices(turn)[group] @ arm)[..., 0] + (center + transforms.translation)[group]
-    quats = quat_multiply_torch(turn[group], base.quats.double())
+    means = (matrices[group] @ arm)[..., 0] + (center + transforms.translation)[group]
+    quats = _products(turn[group], base.quats.double()) @ to_product
     return replace(base, means=means.float(), quats=quats.float())
+
+
+def _products(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """[n, 16]: the products of the numbers of two quaternions."""
+    return (a[:, :, None] * b[:, None]).reshape(-1, 16)
+
+
+@functools.cache
+def _quadratic_forms(device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
+    """What makes of the products [16] of two quaternions' numbers a rotation matrix and their Hamilton product.
+
+    That is [16, 9], for one quaternion of norm 1, and [16, 4]: two operations each instead of dozens. Kept.
+    """
+    units = torch.eye(4, dtype=torch.float64, device=device)
+    first, second = units.repeat_interleave(4, 0), units.repeat(4, 1)
+    # A matrix is a quadratic form, so half of what a sum of two units has beyond each of them belongs to their product.
+    both, one, other = (_of_unit_norm(value) for value in (first + second, first, second))
+    return 0.5 * (both - one - other), quat_multiply_torch(first, second)
+
+
+def _of_unit_norm(quats: torch.Tensor) -> torch.Tensor:
+    """[n, 9]: the quadratic form that is the rotation matrix of a quaternion of norm 1, of quaternions of any norm."""
+    return rotation_matrices(quats).reshape(-1, 9) * quats.square().sum(1, keepdim=True)
 
 
 def transform_vjp(leaves: Gaussians[torch.Tensor], transforms: GroupTransforms[torch.Tensor]) -> torch.Tensor:
@@ -50,20 +76,17 @@ def transform_vjp(leaves: Gaussians[torch.Tensor], transforms: GroupTransforms[t
 
 
 class Pinhole(NamedTuple):
-    """A camera as numbers, or as tensors [] where the rows are: both go along with every operation.
+    """A camera in float64: ``rotation`` [3, 3], ``offset`` [3] from the world to it; ``focal`` [2], pixels."""
 
-    ``rotation`` three rows of three, ``offset`` three: from the world to the camera. ``focal`` two, pixels.
-    """
-
-    rotation: Any
-    offset: Any
-    focal: Any
+    rotation: torch.Tensor
+    offset: torch.Tensor
+    focal: torch.Tensor
 
     @staticmethod
     def of(cameras: Cameras, view: int) -> Pinhole:
-        """Return a camera of a rig as numbers: a matrix would be copied to the device of the rows."""
-        pose = cameras.viewmats[view]
-        return Pinhole(pose[:3, :3].tolist(), pose[:3, 3].tolist(), cameras.Ks[view].diagonal()[:2].tolist())
+        """Return a camera of a rig, in the processor's memory."""
+        pose, focal = torch.as_tensor(cameras.viewmats[view]).double(), torch.as_tensor(cameras.Ks[view]).diagonal()
+        return Pinhole(pose[:3, :3], pose[:3, 3], focal[:2].double())
 
 
 def curvature_of(
@@ -90,7 +113,7 @@ def curvature_of(
     """
     by_row = _on_screen(means.double(), transforms, camera, cameras.near_plane)
     xx, xy, yy = structure.double().unbind(1)
-    tensor = torch.stack([torch.stack([xx, xy], -1), torch.stack([xy, yy], -1)], -2)
+    tensor = torch.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2)
     out = by_row.new_zeros(len(transforms.center), 6, 6)
     out.index_add_(0, transforms.group, by_row.transpose(1, 2) @ tensor @ by_row)
     return out / (3 * cameras.height * cameras.width)
@@ -100,25 +123,21 @@ def _on_screen(
     means: torch.Tensor, transforms: GroupTransforms[torch.Tensor], camera: Pinhole, near: float
 ) -> torch.Tensor:
     """[A, 2, 6] derivative of each row's place on the screen, pixels, by shift and turn of its group."""
-    rotation, offset, focal = camera
-    x, y, z = means.unbind(1)
-    seen = [row[0] * x + row[1] * y + row[2] * z + at for row, at in zip(rotation, offset, strict=True)]
-    depth = seen[2].clamp_min(near)
-    by_shift = [
-        torch.stack(
-            [focal[i] * (rotation[i][axis] - seen[i] / depth * rotation[2][axis]) / depth for axis in range(3)],
-            1,
-        )
-        for i in range(2)
-    ]
-    translation = torch.stack(by_shift, 1)
+    rotation, offset, focal = (value.to(means.device) for value in camera)
+    seen = torch.addmm(offset, means, rotation.T)
+    depth = seen[:, 2:].clamp_min(near)
+    aside = torch.addcmul(rotation[:2], (seen[:, :2] / depth)[..., None], rotation[2], value=-1)
+    translation = aside * (focal / depth)[..., None]
     arm = means - (transforms.center + transforms.translation)[transforms.group]
     turned = _cross(arm[:, None], translation)
     return torch.cat([translation, 2 * turned], -1)
 
 
 def _cross(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Cross products [..., 3], each product rounded by itself, as the compiled renderer does it."""
+    """Cross products [..., 3], on the processor each product rounded by itself, as the compiled renderer does it."""
+    if a.device.type != "cpu":
+        crossed: torch.Tensor = torch.linalg.cross(a, b)
+        return crossed
     (ax, ay, az), (bx, by, bz) = a.unbind(-1), b.unbind(-1)
     return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
 
@@ -137,12 +156,11 @@ def weighted_structure_tensor(image: torch.Tensor, target: torch.Tensor) -> torc
     """
     down, right = _image_gradients(image, 0), _image_gradients(image, 1)
     weight = ((image - target).square() + MIN_ERROR**2).rsqrt()
-    pairs = (right, right), (right, down), (down, down)
-    return torch.stack([(weight * one * other).sum(-1) for one, other in pairs], -1)
+    pairs = torch.stack([right, right, down], -2), torch.stack([right, down, down], -2)
+    return (weight[..., None, :] * pairs[0] * pairs[1]).sum(-1)
 
 
 def _image_gradients(image: torch.Tensor, axis: int) -> torch.Tensor:
-    last = image.shape[axis] - 1
-    places = torch.arange(last + 1, device=image.device)
-    after = image.index_select(axis, (places + 1).clamp_max(last))
-    return 0.5 * (after - image.index_select(axis, (places - 1).clamp_min(0)))
+    size = image.shape[axis]
+    wider = torch.cat([image.narrow(axis, 0, 1), image, image.narrow(axis, size - 1, 1)], axis)
+    return 0.5 * (wider.narrow(axis, 2, size) - wider.narrow(axis, 0, size))

@@ -159,6 +159,7 @@ NAMES = (
     ("s2gs-fast", ("stream.epochs=3", "gate=always-open"), "s2gs-fast + gate=always-open, stream.epochs=3"),
     ("s2gs-fast", ("gate.temperature=0.123",), "s2gs-fast + gate.temperature=0.123"),
     ("s2gs-fast", ("update.sh0.latent=7",), "s2gs-fast + update.sh0.latent=7"),
+    ("dense", ("streaming_method=hold",), "hold"),
     ("hold", ("frames=3", "seed=4", "scale=0.5", "data.train_views=3", "renderer=reference"), "hold"),
     ("dense", tuple(f"first_frame.{key}=7" for key in ("epochs", "max_points", "max_gaussians", "max_iterations")),
      "dense + first_frame.epochs=7, first_frame.max_iterations=7, first_frame.max_points=7 and 1 more"),

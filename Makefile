@@ -61,6 +61,7 @@ test-live: setup
 
 docs: setup
 	$(BIN)/python -m tools.reference
+	$(BIN)/python -m tools.figures
 	@if test -f $(DEMO_OUT)/stream.gss; then $(MAKE) --no-print-directory gallery; fi
 
 gallery: $(DEMO_OUT)/stream.gss

@@ -1,7 +1,7 @@
 """Numbers of the results pages: from plans of sweeps to docs/results/data, and from there into the pages.
 
     python -m tools.results run --data DATA --out RUNS [NAME ...]
-    python -m tools.results take NAME SWEEP --commit HASH [--at FRAME ...]
+    python -m tools.results take NAME SWEEP --commit HASH [--at FRAME ...] [--every N]
     python -m tools.results fill [--check]
 
 The first runs the plans of ``configs/sweeps/results`` one after the other (or goes on with them), takes their numbers
@@ -10,7 +10,7 @@ and fills in the pages. The second takes the numbers of one sweep that ran elsew
 of what changed and is seen in each FRAME is taken, too, as ``frame_8``. The third fills in every table of a page
 between two comments: of rows of files, of those with some names, or of a table of the paper:
 
-    <!-- rows of protocol, protocol-peers: psnr_first psnr kb -->
+    <!-- rows of protocol, protocol-long: psnr_first psnr kb -->
     <!-- rows of components, only 1-dense 5-hfp: psnr kb -->
     <!-- rows of paper-components: row psnr kb -->
     <!-- end of rows -->
@@ -19,7 +19,7 @@ and every number within a sentence: a quantity of a run, its difference or ratio
 BD-rate: by how many percent the bytes of a curve differ from another's at equal quality. A curve is the runs whose
 names begin alike:
 
-    <!-- protocol-peers: comgs-l kb / s2gs-edge -->2.4<!-- end --> times the bytes
+    <!-- protocol: comgs-l kb / s2gs-edge -->2.4<!-- end --> times the bytes
     <!-- curves: root psnr_changed % open -->-15<!-- end --> %
 
 Rows of one name are runs with different seeds, of which mean and standard deviation are shown. With ``--check`` nothing
@@ -34,6 +34,7 @@ import math
 import re
 import statistics
 import subprocess
+import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -43,10 +44,12 @@ from gsstream_lab.report.groups import Run, read_sweep_data
 from gsstream_lab.report.paper import paper_table
 from gsstream_lab.report.quantities import BY_KEY, cell, spread
 from gsstream_lab.report.rate_curves import bd_rate
+from gsstream_lab.sweep.drive import cell_file
 
 from gsstream.core.errors import InputError
 from gsstream.evaluation.records import mean_of_views
 from gsstream.evaluation.summary import format_table
+from gsstream.play import Playback
 
 ROOT = Path(__file__).parents[1]
 PAGES, PLANS = ROOT / "docs" / "results", ROOT / "configs" / "sweeps" / "results"
@@ -68,15 +71,19 @@ PRINTED = "paper-"
 Row = dict[str, Any]
 
 
-def rows_of_sweep(folder: Path, commit: str, at: Sequence[int] = ()) -> list[Row]:
+def rows_of_sweep(folder: Path, commit: str, at: Sequence[int] = (), every: int = 0) -> list[Row]:
     """Return the numbers of a sweep's finished runs, and where they come from. Raises InputError without any.
 
-    ``at``: frames whose PSNR on what changed and is seen stands on its own.
+    ``at``: frames whose PSNR on what changed and is seen stands on its own. ``every``: above 0, the PSNR of each so
+    manieth frame stands as ``curve_psnr``.
     """
     data = read_sweep_data(folder)
-    rows = []
+    rows, curves = [], dict[str, Any]()
     for group in data.groups:
         for run in group.runs:
+            if every:
+                curve = [mean_of_views([frame], "psnr") for frame in run.row["frames"][::every]]
+                curves = {"curve_every": every, "curve_psnr": [round(value, 2) for value in curve]}
             alone = {f"frame_{t}": mean_of_views([run.row["frames"][t]], "psnr_changed_seen") for t in at}
             found = {**run.values, **alone}
             values = {key: float(f"{value:.6g}") for key, value in found.items() if math.isfinite(value)}
@@ -93,6 +100,8 @@ def rows_of_sweep(folder: Path, commit: str, at: Sequence[int] = ()) -> list[Row
                     "frames": frames,
                     **values,
                     **_phases(run),
+                    **_decoding(cell_file(folder, run.row["id"])),
+                    **curves,
                     **origin,
                     **machine,
                 }
@@ -106,6 +115,18 @@ def _phases(run: Run) -> dict[str, float]:
     names = dict.fromkeys(name for seconds in later for name in seconds)
     means = {name: statistics.fmean(seconds.get(name, 0.0) for seconds in later) for name in names}
     return {f"ms_{name}": float(f"{1e3 * mean:.4g}") for name, mean in means.items()}
+
+
+def _decoding(stream: Path) -> dict[str, float]:
+    """Return the median wall milliseconds in which Python's player decodes a delta of a stream, as ``ms_decode``."""
+    if not stream.is_file():
+        return {}
+    with Playback(stream) as frames:
+        clock, taken = time.perf_counter(), list[float]()
+        for _ in frames:
+            taken.append(time.perf_counter() - clock)
+            clock = time.perf_counter()
+    return {"ms_decode": float(f"{1e3 * statistics.median(taken[1:]):.4g}")} if len(taken) > 1 else {}
 
 
 def _which(row: Row) -> tuple[Any, ...]:
@@ -245,11 +266,11 @@ def fill(pages: Sequence[Path], check: bool, folder: Path = PAGES) -> list[Path]
     return differ
 
 
-def take(name: str, sweep: Path, commit: str, at: Sequence[int] = ()) -> None:
+def take(name: str, sweep: Path, commit: str, at: Sequence[int] = (), every: int = 0) -> None:
     """Write the numbers of a sweep to its data file."""
     path = PAGES / "data" / f"{name}.jsonl"
     path.parent.mkdir(exist_ok=True)
-    rows = merged(read_rows(name, PAGES) if path.is_file() else [], rows_of_sweep(sweep, commit, at))
+    rows = merged(read_rows(name, PAGES) if path.is_file() else [], rows_of_sweep(sweep, commit, at, every))
     path.write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")
     print(f"{len(rows)} runs in {path}")
 
@@ -282,11 +303,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     taking.add_argument("sweep", type=Path)
     taking.add_argument("--commit", required=True, help="of the code that ran")
     taking.add_argument("--at", type=int, nargs="*", default=[], metavar="FRAME", help="what changed in it and is seen")
+    taking.add_argument("--every", type=int, default=0, metavar="N", help="the PSNR of each Nth frame, for a figure")
     pages = commands.add_parser("fill", help="make the tables and numbers of the pages from the data")
     pages.add_argument("--check", action="store_true", help="only say which pages differ")
     given = parser.parse_args(arguments)
     if given.command == "take":
-        take(given.name, given.sweep, given.commit, given.at)
+        take(given.name, given.sweep, given.commit, given.at, given.every)
         return 0
     if given.command == "run":
         run(given.names or all_plans, given.data, given.out)

@@ -83,10 +83,9 @@ class ToyScene:
         return FLASH if self.name == "flash" and late == 0 else 1.0
 
     def shade(self, index: int, places: FloatArray) -> FloatArray:
-        """Return the factor [P] on the colours of places [P, 3], scene units: below 1 under the cloud, where y > 0."""
+        """Return the cloud's factor [P] on the colours of places [P, 3], scene units: below 1 where y > 0."""
         under = np.clip(0.5 + places[:, 1] / (2 * RIM), 0, 1).astype(np.float32)
-        darkest = _dimmed(index - self.event) if self.name == "cloud" else 1.0
-        factor: FloatArray = 1 - under * np.float32(1 - darkest)
+        factor: FloatArray = 1 - under * np.float32(1 - _dimmed(index - self.event))
         return factor
 
 

@@ -97,14 +97,15 @@ def shown(rig: Path, out: Path, size: tuple[int, int], test: str) -> dict[str, A
 
 def _latencies(out: Path, late: Sequence[dict[str, float]], finished: Sequence[Sequence[float]]) -> dict[str, Any]:
     """Medians over the encoded frames that the page drew, milliseconds; all clocks are this machine's."""
-    exposed = {line["frame"]: 1000 * line["time"] for line in read_lines(out / "capture" / "capture.jsonl")}
+    captured = read_lines(out / "capture" / "capture.jsonl")
+    exposed = {line["frame"]: 1000 * line["time"] for line in captured}
+    written = {line["frame"]: line["written_ms"] for line in captured}
     lines = [line for line in read_lines(out / "run" / METRICS)[1:] if line["live"]["policy"] is None]
     steps = {line["frame"]: 1000 * sum(line["seconds"].values()) for line in lines}
     there: dict[int, float] = {}
     for frame, when in finished:
         there.setdefault(int(frame), when)
     rows = [(int(entry["frame"]), entry) for entry in late if entry["frame"] in there and entry["frame"] in steps]
-    written = {line["frame"]: line["written_ms"] for line in read_lines(out / "capture" / "capture.jsonl")}
     times = {
         "exposure_to_file_ms": [written[frame] for frame, _ in rows],
         "frame_step_ms": [steps[frame] for frame, _ in rows],

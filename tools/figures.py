@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import matplotlib as mpl
 from gsstream_lab.report.figures import style
-from gsstream_lab.report.fronts import pareto_front
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
@@ -50,22 +49,24 @@ class Picture(NamedTuple):
     draw: Callable[[Any, Sequence[Any]], None]
 
 
+def _by_name(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    out: dict[str, list[Row]] = {}
+    for row in rows:
+        out.setdefault(row["name"], []).append(row)
+    return out
+
+
 def points_of(rows: Sequence[Row], cost: str) -> list[Point]:
     """Return the methods of rows that change something, in their order: mean cost, and mean PSNR of changed pixels."""
-    by_name: dict[str, list[Row]] = {}
-    for row in rows:
-        if row["kb"] > 0.5:  # hold, which sends nothing, has no place on an axis of powers
-            by_name.setdefault(row["name"], []).append(row)
+    sends = [row for row in rows if row["kb"] > 0.5]  # hold, which sends nothing, has no place on an axis of powers
     return [
         Point(name, *(round(statistics.fmean(run[key] for run in runs), 2) for key in (cost, "psnr_changed")))
-        for name, runs in by_name.items()
+        for name, runs in _by_name(sends).items()
     ]
 
 
 def draw_points(axis: Any, points: Sequence[Point]) -> None:
-    """Draw methods and their front: none on it is beaten in both numbers."""
-    front = [points[i] for i in pareto_front([(point.cost, point.quality) for point in points])]
-    axis.step([p.cost for p in front], [p.quality for p in front], where="post", color="#444444", linewidth=1, zorder=0)
+    """Draw methods, ours larger."""
     for point in points:
         ours = point.name.startswith("s2gs")
         axis.plot(point.cost, point.quality, "o", color=COLORS[1 if ours else 0], markersize=7 if ours else 5)
@@ -78,28 +79,23 @@ def draw_points(axis: Any, points: Sequence[Point]) -> None:
     axis.set_ylabel("PSNR of changed pixels, dB", fontsize=9)
 
 
-def curves_of(rows: Sequence[Row]) -> list[tuple[str, int, list[float]]]:
-    """Return (method, frames between two numbers, mean PSNR over its seeds)."""
-    by_name: dict[str, list[Row]] = {}
-    for row in rows:
-        if row["name"] in DRAWN:
-            by_name.setdefault(row["name"], []).append(row)
+def curves_of(rows: Sequence[Row]) -> list[tuple[str, list[float]]]:
+    """Return (method, mean PSNR of every frame over its seeds)."""
+    drawn = [row for row in rows if row["name"] in DRAWN]
     return [
         (
             name,
-            runs[0]["curve_every"],
             [round(statistics.fmean(values), 2) for values in zip(*(run["curve_psnr"] for run in runs), strict=True)],
         )
-        for name, runs in by_name.items()
+        for name, runs in _by_name(drawn).items()
     ]
 
 
-def draw_curves(axis: Any, curves: Sequence[tuple[str, int, list[float]]]) -> None:
+def draw_curves(axis: Any, curves: Sequence[tuple[str, list[float]]]) -> None:
     """Draw the PSNR of whole pictures over the frames, each line with its name in the legend, the best first."""
-    by_end = sorted(curves, key=lambda curve: -statistics.fmean(curve[2][-5:]))
-    for color, (name, every, values) in zip(COLORS, by_end, strict=False):
-        frames = [every * number for number in range(len(values))]
-        axis.plot(frames, values, color=color, linewidth=1.5, label=name)
+    by_end = sorted(curves, key=lambda curve: -statistics.fmean(curve[1][-5:]))
+    for color, (name, values) in zip(COLORS, by_end, strict=False):
+        axis.plot(range(len(values)), values, color=color, linewidth=1.5, label=name)
     style(axis, logarithmic=False)
     axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     axis.set_xlabel("frame", fontsize=9)

@@ -1,7 +1,7 @@
 """Numbers of the results pages: from plans of sweeps to docs/results/data, and from there into the pages.
 
     python -m tools.results run --data DATA --out RUNS [NAME ...]
-    python -m tools.results take NAME SWEEP --commit HASH [--at FRAME ...] [--every N]
+    python -m tools.results take NAME SWEEP --commit HASH [--at FRAME ...]
     python -m tools.results fill [--check]
 
 The first runs the plans of ``configs/sweeps/results`` one after the other (or goes on with them), takes their numbers
@@ -68,22 +68,22 @@ NUMBER = re.compile(
 #: Begins the names of the tables that the paper prints, which the lab has.
 PRINTED = "paper-"
 
+#: Plans of which a figure (tools/figures.py) shows the PSNR of every frame.
+WITH_CURVES = frozenset({"protocol"})
+
 Row = dict[str, Any]
 
 
-def rows_of_sweep(folder: Path, commit: str, at: Sequence[int] = (), every: int = 0) -> list[Row]:
+def rows_of_sweep(folder: Path, commit: str, at: Sequence[int] = (), curve: bool = False) -> list[Row]:
     """Return the numbers of a sweep's finished runs, and where they come from. Raises InputError without any.
 
-    ``at``: frames whose PSNR on what changed and is seen stands on its own. ``every``: above 0, the PSNR of each so
-    manieth frame stands as ``curve_psnr``.
+    ``at``: frames whose PSNR on what changed and is seen stands on its own. ``curve``: the PSNR of every
+    frame stands as ``curve_psnr``.
     """
     data = read_sweep_data(folder)
-    rows, curves = [], dict[str, Any]()
+    rows = []
     for group in data.groups:
         for run in group.runs:
-            if every:
-                curve = [mean_of_views([frame], "psnr") for frame in run.row["frames"][::every]]
-                curves = {"curve_every": every, "curve_psnr": [round(value, 2) for value in curve]}
             alone = {f"frame_{t}": mean_of_views([run.row["frames"][t]], "psnr_changed_seen") for t in at}
             found = {**run.values, **alone}
             values = {key: float(f"{value:.6g}") for key, value in found.items() if math.isfinite(value)}
@@ -101,7 +101,7 @@ def rows_of_sweep(folder: Path, commit: str, at: Sequence[int] = (), every: int 
                     **values,
                     **_phases(run),
                     **_decoding(cell_file(folder, run.row["id"])),
-                    **curves,
+                    **({"curve_psnr": _psnr_by_frame(run)} if curve else {}),
                     **origin,
                     **machine,
                 }
@@ -115,6 +115,10 @@ def _phases(run: Run) -> dict[str, float]:
     names = dict.fromkeys(name for seconds in later for name in seconds)
     means = {name: statistics.fmean(seconds.get(name, 0.0) for seconds in later) for name in names}
     return {f"ms_{name}": float(f"{1e3 * mean:.4g}") for name, mean in means.items()}
+
+
+def _psnr_by_frame(run: Run) -> list[float]:
+    return [round(mean_of_views([frame], "psnr"), 2) for frame in run.row["frames"]]
 
 
 def _decoding(stream: Path) -> dict[str, float]:
@@ -266,11 +270,12 @@ def fill(pages: Sequence[Path], check: bool, folder: Path = PAGES) -> list[Path]
     return differ
 
 
-def take(name: str, sweep: Path, commit: str, at: Sequence[int] = (), every: int = 0) -> None:
+def take(name: str, sweep: Path, commit: str, at: Sequence[int] = ()) -> None:
     """Write the numbers of a sweep to its data file."""
     path = PAGES / "data" / f"{name}.jsonl"
     path.parent.mkdir(exist_ok=True)
-    rows = merged(read_rows(name, PAGES) if path.is_file() else [], rows_of_sweep(sweep, commit, at, every))
+    before = read_rows(name, PAGES) if path.is_file() else []
+    rows = merged(before, rows_of_sweep(sweep, commit, at, curve=name in WITH_CURVES))
     path.write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")
     print(f"{len(rows)} runs in {path}")
 
@@ -303,12 +308,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     taking.add_argument("sweep", type=Path)
     taking.add_argument("--commit", required=True, help="of the code that ran")
     taking.add_argument("--at", type=int, nargs="*", default=[], metavar="FRAME", help="what changed in it and is seen")
-    taking.add_argument("--every", type=int, default=0, metavar="N", help="the PSNR of each Nth frame, for a figure")
     pages = commands.add_parser("fill", help="make the tables and numbers of the pages from the data")
     pages.add_argument("--check", action="store_true", help="only say which pages differ")
     given = parser.parse_args(arguments)
     if given.command == "take":
-        take(given.name, given.sweep, given.commit, given.at, given.every)
+        take(given.name, given.sweep, given.commit, given.at)
         return 0
     if given.command == "run":
         run(given.names or all_plans, given.data, given.out)

@@ -159,11 +159,14 @@ def test_what_changed_in_a_frame_and_is_seen_is_that_of_an_evaluation(tmp_path: 
     )
     program = [sys.executable, "-c", "from gsstream.cli.main import main; main()"]
     subprocess.run([*program, "sweep", str(plan), "--out", str(tmp_path / "out")], check=True, capture_output=True)
-    (row,) = rows_of_sweep(tmp_path / "out", "abc", at=[5])
+    (row,) = rows_of_sweep(tmp_path / "out", "abc", at=[5], curve=True)
     (stream,) = (tmp_path / "out" / "cells").glob("*.gss")
     with open_recording("demo") as source:
         views = [asdict(view) for view in evaluate(stream, source).views]
     assert row["frame_5"] == pytest.approx(views[5]["psnr_changed_seen"], rel=1e-5)
+    assert row["curve_psnr"] == pytest.approx([view["psnr"] for view in views], abs=0.006)
+    assert row["ms_decode"] > 0
+    assert row["frame_0_of"] == row["name"]
     assert row["psnr_seen"] == pytest.approx(sum(view["psnr_seen"] for view in views[1:]) / 5, rel=1e-5)
 
 

@@ -62,14 +62,27 @@ def test_some_seconds_of_it(tmp_path: Path) -> None:
     assert first["command"] == draw_case(3, 0, CATALOG).command
 
 
-def test_a_hang_is_recorded_and_the_next_case_gets_its_turn(tmp_path: Path) -> None:
-    soak.main(["--minutes", "0.06", "--seed", "3", "--limit", "0.02", "--out", str(tmp_path)])
-    runs = soak.read_runs(tmp_path)
-    assert runs[0]["outcome"]["status"] == "hung"
-    # What really hangs stands still. This case runs on while its stack is written: only the innermost call is certain.
+#: Python runs this before anything else; the folder of the program is not yet among those that modules come from.
+STANDSTILL = """
+import sys, time
+sys.path.insert(0, {root!r})
+from tools.soak import drive
+drive.run_case = lambda *case: time.sleep(600)
+"""
+
+
+def test_a_hang_is_recorded_and_the_next_case_gets_its_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The hang is a real one in the working process: a stack that runs on while it is written shows nothing certain."""
+    (tmp_path / "sitecustomize.py").write_text(STANDSTILL.format(root=str(soak.ROOT)), encoding="utf-8")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    out = tmp_path / "out"
+    soak.main(["--minutes", "0.06", "--seed", "3", "--limit", "0.2", "--out", str(out)])
+    runs = soak.read_runs(out)
+    assert {run["outcome"]["status"] for run in runs} == {"hung"}
     problem = runs[0]["outcome"]["problem"]
     assert "Timeout" in problem, problem
-    assert '  File "' in problem, "the record shows where it hung"
+    assert "sitecustomize.py" in problem, "the record shows where it hung"
+    assert "in work" in problem, "the record shows what called"
     assert [run["index"] for run in runs] == list(range(len(runs)))
 
 

@@ -27,6 +27,8 @@ class PlayerState:
         delta: what the packet of this frame changed; None after a key or an empty packet.
         before: the layout that ``delta`` refers to, that of the frame before; None without a delta.
         key_rows: number of Gaussians of the last key packet.
+        replaced: the scene of the frame before, which the key packet of this frame replaced; None where this frame has
+            another packet, or the player began with it.
     """
 
     frame: int
@@ -36,6 +38,7 @@ class PlayerState:
     delta: Delta | None = None
     before: Layout | None = None
     key_rows: int = 0
+    replaced: Scene | None = None
 
     @property
     def gaussians(self) -> Gaussians[FloatArray]:
@@ -52,7 +55,7 @@ def decode_packet(state: PlayerState | None, data: bytes, *, offset: int = 0) ->
     """Return the state after one complete packet. Raises PacketError with the byte offset.
 
     Arguments:
-        state: that of the frame before; a key packet needs none.
+        state: that of the frame before; a key packet needs none, and is the same scene with one.
         data: the packet.
         offset: its place in the file, for errors.
     """
@@ -60,14 +63,15 @@ def decode_packet(state: PlayerState | None, data: bytes, *, offset: int = 0) ->
     if header.kind == PacketKind.KEY:
         key = decode_key(data, offset=offset)
         scene = Scene(key.gaussians, key.layout)
-        return PlayerState(header.frame, scene, key.meta, key_rows=len(key.gaussians))
+        replaced = state.scene if state is not None and header.frame == state.frame + 1 else None
+        return PlayerState(header.frame, scene, key.meta, key_rows=len(key.gaussians), replaced=replaced)
     if state is None or header.frame != state.frame + 1:
         had = "none" if state is None else f"frame {state.frame}"
         raise PacketError(f"frame {header.frame} needs the state of the frame before it, got {had}", offset)
     if header.kind == PacketKind.EMPTY:
         decode_empty(data, offset=offset)
         still = replace(state.scene, displacement=None)
-        return replace(state, frame=header.frame, scene=still, delta=None, before=None)
+        return replace(state, frame=header.frame, scene=still, delta=None, before=None, replaced=None)
     delta = decode_delta(data, state.scene, state.decoders, offset=offset)
     try:
         scene = apply_delta(state.scene, delta)

@@ -6,11 +6,13 @@ They are checked on two bodies before three cameras: frames of which the true mo
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 
 from gsstream.core.changes import Delta, Displacement, Field, Layout, Motion, RowEdit, Scene, apply_delta
+from gsstream.core.changes.scene import Groups
 from gsstream.core.frame import Frame
 from gsstream.core.log import FrameLog
 from gsstream.core.rng import Rng
@@ -53,13 +55,17 @@ def shifted(one: tuple[float, float, float], two: tuple[float, float, float]) ->
     return pixels / np.float32(PIXELS)
 
 
-def after_motion(part: MotionPart, before: Scene, shift: FloatArray, *, everywhere: bool = False) -> FloatArray:
+def after_motion(
+    part: MotionPart, before: Scene, shift: FloatArray, *, everywhere: bool = False, memory: Any = None
+) -> FloatArray:
     """Return the centres [2 NUMBER, 3] to which a part moves the bodies when pictures show them displaced by ``shift``.
 
-    With ``everywhere`` all tiles count as changed, otherwise those in which the pictures differ.
+    With ``everywhere`` all tiles count as changed, otherwise those in which the pictures differ. ``memory``: what the
+    part kept across a key packet; None: it follows a delta packet.
     """
     work, rng = _work(before, shift, everywhere=everywhere)[1:]
-    memory = part.follow(None, BODIES_INDEX - 1, before.layout, Delta(), rng)
+    if memory is None:
+        memory = part.follow(None, BODIES_INDEX - 1, before.layout, Delta(), rng)
     found = Delta(tuple(motion for motion in part.propose(before, work, rng, memory) if not motion.is_empty))
     return apply_delta(before, found).gaussians.means
 
@@ -150,6 +156,23 @@ def check_motion_follow(part: MotionPart) -> None:
         assert fingerprint(memory) == before, f"frame {frame}: what was remembered before was changed"
         memory, scene = after, apply_delta(scene, delta)
     part.propose(scene, case.work.on(scene.gaussians.map(torch.from_numpy)), case.rng, memory)
+
+
+@check("motion")
+def check_motion_across_key(part: MotionPart) -> None:
+    """What a part keeps across a key packet follows from two scenes, neither is changed, and a frame is proposed."""
+    case = fit_fixture()
+    order = np.random.default_rng(0).permutation(len(case.scene.gaussians))
+    moved = np.full((len(order), 3), 0.02, np.float32)
+    groups = Groups(0.5, 2, np.zeros(len(order), np.int32), 1)
+    replaced = replace(case.scene, displacement=Displacement(np.arange(len(order)), moved, 0 * moved), groups=groups)
+    key = Scene(case.scene.gaussians.rows(order), Layout.flat(len(order), 1.0))
+    before = fingerprint((replaced, key))
+    memory = part.across_key(replaced, key)
+    again = type(part)(part.config).across_key(replaced, key)
+    assert fingerprint(memory) == fingerprint(again), "two calls keep different things"
+    assert fingerprint((replaced, key)) == before, "a scene was changed"
+    part.propose(key, case.work.on(key.gaussians.map(torch.from_numpy)), case.rng, memory)
 
 
 @check("motion")

@@ -263,9 +263,9 @@ def test_the_key_packet_holds_the_refined_scene() -> None:
     found: list[Refinement] = []
     original = keyframes.refined_key_step
 
-    def watched(parts: Any, state: Any, *rest: Any) -> EncodedFrame:
+    def watched(parts: Any, state: Any, *rest: Any, **named: Any) -> EncodedFrame:
         found.append(state.refinement)
-        return original(parts, state, *rest)
+        return original(parts, state, *rest, **named)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(keyframes, "refined_key_step", watched)

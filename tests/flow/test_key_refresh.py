@@ -41,9 +41,9 @@ class Refreshed(Witness):
         self.before: dict[int, Any] = {}
         original = method.key_packet_if_due
 
-        def refresh(parts, step, *args):
+        def refresh(parts, step, *args, **named):
             self.before[step.packet.frame] = step.state
-            return original(parts, step, *args)
+            return original(parts, step, *args, **named)
 
         monkeypatch.setattr(method, "key_packet_if_due", refresh)
 

@@ -22,6 +22,8 @@ from gsstream.core.shapes import FloatArray, IntArray
 #: Cells are counted from -HALF_GRID to HALF_GRID - 1 along each axis; what lies beyond belongs to the outermost one.
 HALF_GRID = 1 << 15
 MAX_BRIGHTNESS_BINS = 16
+#: Numbers of cells along x, y and z, and of classes of brightness.
+PLACES = (2 * HALF_GRID, 2 * HALF_GRID, 2 * HALF_GRID, MAX_BRIGHTNESS_BINS)
 #: Cells per row up to which groups are numbered by a table of all cells around the rows.
 MAX_CELLS_PER_ROW = 64
 
@@ -89,15 +91,35 @@ def groups_for(scene: Scene, cell: float, brightness_bins: int, regroup: bool = 
     known = scene.groups
     if known is not None and not regroup and known.cell == cell and known.brightness_bins == brightness_bins:
         return known
-    columns = np.ascontiguousarray(scene.gaussians.means.T, np.float64)
+    places = _grid_places(scene.gaussians.means, scene.gaussians.sh0, cell, brightness_bins)
+    group_of, count = _numbered(places, PLACES)
+    return Groups(cell, brightness_bins, group_of, count)
+
+
+def grid_places(means: FloatArray, sh0: FloatArray, cell: float, brightness_bins: int) -> IntArray:
+    """Return a number [N] int64 for the cell and the shade of each row; rows of one group have the same.
+
+    Arguments:
+        means: [N, 3], scene units.
+        sh0: [N, 1, 3].
+        cell: side of a cell, scene units.
+        brightness_bins: number of classes of brightness, 1 to 16.
+    """
+    number = np.zeros(len(means), np.int64)
+    for digit, base in zip(_grid_places(means, sh0, cell, brightness_bins), PLACES, strict=True):
+        number = number * base + digit
+    return number
+
+
+def _grid_places(means: FloatArray, sh0: FloatArray, cell: float, brightness_bins: int) -> tuple[IntArray, ...]:
+    """Cell x, y, z and class of brightness [N] int64 each of every row."""
+    columns = np.ascontiguousarray(means.T, np.float64)
     columns /= float(cell)
     index = np.clip(np.floor(columns, out=columns), -HALF_GRID, HALF_GRID - 1, out=columns)
     x, y, z = index.astype(np.int64) + HALF_GRID
-    red, green, blue = scene.gaussians.sh0[:, 0].astype(np.float64).T
+    red, green, blue = sh0[:, 0].astype(np.float64).T
     bright = 0.5 + SH0 * (0.25 * red + 0.5 * green + 0.25 * blue)
-    shade = np.clip(np.floor(bright * brightness_bins), 0, brightness_bins - 1).astype(np.int64)
-    group_of, count = _numbered((x, y, z, shade), (2 * HALF_GRID, 2 * HALF_GRID, 2 * HALF_GRID, MAX_BRIGHTNESS_BINS))
-    return Groups(cell, brightness_bins, group_of, count)
+    return x, y, z, np.clip(np.floor(bright * brightness_bins), 0, brightness_bins - 1).astype(np.int64)
 
 
 def _numbered(digits: Sequence[IntArray], bases: Sequence[int]) -> tuple[IntArray, int]:
@@ -142,15 +164,15 @@ def predict_transforms(scene: Scene, groups: Groups, moving: IntArray, predicted
     # take() throughout: it gathers rows four times as fast as an index in brackets, and players do this in every frame.
     rows = np.flatnonzero(moving.astype(bool).take(groups.group_of))
     group = rank.take(groups.group_of.take(rows))
-    center = _means(scene.gaussians.means.take(rows, 0), group, len(which))
+    center = group_means(scene.gaussians.means.take(rows, 0), group, len(which))
     translation: FloatArray = np.zeros((len(which), 3))
     rotation: FloatArray = np.zeros((len(which), 3))
     if predicted and scene.displacement is not None:
         past = rank.take(groups.group_of.take(scene.displacement.rows))
         here = np.flatnonzero(past >= 0)
         past = past.take(here)
-        translation = _means(scene.displacement.translation.take(here, 0), past, len(which))
-        rotation = _means(scene.displacement.rotation.take(here, 0), past, len(which))
+        translation = group_means(scene.displacement.translation.take(here, 0), past, len(which))
+        rotation = group_means(scene.displacement.rotation.take(here, 0), past, len(which))
     return GroupTransforms(rows=rows, group=group, center=center, translation=translation, rotation=rotation)
 
 
@@ -261,7 +283,7 @@ def quat_multiply(a: FloatArray, b: FloatArray) -> FloatArray:
     ).T
 
 
-def _means(values: FloatArray, group: IntArray, number: int) -> FloatArray:
+def group_means(values: FloatArray, group: IntArray, number: int) -> FloatArray:
     """[K, 3] float64 mean of the rows in each of ``number`` places; 0 where there are none."""
     counts = np.maximum(np.bincount(group, minlength=number), 1)
     columns_of = values.T.astype(np.float64, order="C")

@@ -132,11 +132,17 @@ def key_state(
     meta: StreamMeta,
     rng: Rng,
     first: BoolArray | None = None,
+    before: PlayerState | None = None,
 ) -> tuple[StreamState, EncodedPacket]:
-    """Encode a key packet and continue from its decoded bytes; ``meta``: result of :func:`key_meta`."""
+    """Encode a key packet and continue from its decoded bytes.
+
+    Arguments:
+        meta: result of :func:`key_meta`.
+        before: what players have after the frame before; None for the first frame.
+    """
     arrays: Gaussians[FloatArray] = gaussians.map(lambda t: np.ascontiguousarray(t.numpy()))
     packet = encode_key(KeyState(arrays, layout, meta), frame=frame.index, first=first)
-    player = decode_packet(None, packet.data)
+    player = decode_packet(before, packet.data)
     decoders = assembly.update.init_decoders(gaussians, rng.stream("decoders", frame.index))
     state = StreamState(
         player=player,
@@ -146,8 +152,17 @@ def key_state(
         exposure=exposure_from_meta(player.meta),
         key_frame=player.frame,
         shell=shell_behind(assembly, player),
+        motion_memory=memory_across_key(assembly, player),
     )
     return state, replace(packet, decoded=player)
+
+
+def memory_across_key(assembly: Assembly, player: PlayerState) -> Any:
+    """Return what the motion part keeps of the frames before a key packet; None where the stream begins with that."""
+    if player.replaced is None:
+        return None
+    with assembly.use("motion").errors():
+        return assembly.motion.across_key(player.replaced, player.scene)
 
 
 def shell_behind(assembly: Assembly, player: PlayerState) -> Shell | None:

@@ -21,16 +21,17 @@ from gsstream.engine.frame0.refine import SHOWN, is_refined
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.metrics import log_packet
 from gsstream.method.tools import Tools
-from gsstream.packet import StreamMeta, quantise_key
+from gsstream.packet import PlayerState, StreamMeta, quantise_key
 
 #: Why a frame became a key packet: the refined first frame is ready.
 REFINED = "refined"
 
 
-def key_packet_if_due(assembly: Assembly, step: Step, frame: Frame, tools: Tools) -> Step:
+def key_packet_if_due(assembly: Assembly, step: Step, frame: Frame, tools: Tools, before: PlayerState) -> Step:
     """Return ``step``, or when a key packet is due at this frame, the step that writes one instead.
 
-    A key packet that the budget refuses, or whose frame is skipped, stays due: the next frame tries again.
+    A key packet that the budget refuses, or whose frame is skipped, stays due: the next frame tries again. ``before``:
+    what players have after the frame before.
     """
     reason, state = _due(assembly, step), step.state
     if reason is None:
@@ -42,7 +43,7 @@ def key_packet_if_due(assembly: Assembly, step: Step, frame: Frame, tools: Tools
     # A refined scene was fitted to the pictures of this frame; another may show older ones.
     made, shown = (refined_key_step, frame) if reason == REFINED else (reencode_as_key, state.previous)
     with tools.log.phase("key"):
-        after = made(assembly, state, frame, tools.meta(frame), tools.rng)
+        after = made(assembly, state, frame, meta=tools.meta(frame), rng=tools.rng, before=before)
     max_bytes = tools.budget.max_bytes
     if max_bytes is not None and len(after.packet.data) > max_bytes:
         return _postponed(step, reason, f"{len(after.packet.data)} bytes where {max_bytes} are allowed", tools)
@@ -69,7 +70,9 @@ def _postponed(step: Step, reason: str, refused: str, tools: Tools) -> Step:
     return step
 
 
-def refined_key_step(assembly: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
+def refined_key_step(
+    assembly: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng, before: PlayerState
+) -> Step:
     """Return the refined first frame, as it is now, as a key packet, and the state that follows from its bytes."""
     found = state.refinement
     assert found is not None
@@ -84,16 +87,27 @@ def refined_key_step(assembly: Assembly, state: StreamState, frame: Frame, meta:
         shown=frame.index,
         meta=meta,
         rng=rng,
+        before=before,
         layered=True,
     )
 
 
-def reencode_as_key(assembly: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng) -> Step:
+def reencode_as_key(
+    assembly: Assembly, state: StreamState, frame: Frame, meta: StreamMeta, rng: Rng, before: PlayerState
+) -> Step:
     """Return the current decoded scene as a key packet, and the state that follows from its bytes."""
     gaussians = quantise_key(state.player.gaussians).map(torch.from_numpy)
     levels = decoded_anchors(state.player).levels
     return _key_step(
-        assembly, state, gaussians, levels=levels, frame=frame, shown=state.previous.index, meta=meta, rng=rng
+        assembly,
+        state,
+        gaussians,
+        levels=levels,
+        frame=frame,
+        shown=state.previous.index,
+        meta=meta,
+        rng=rng,
+        before=before,
     )
 
 
@@ -106,6 +120,7 @@ def _key_step(
     shown: int,
     meta: StreamMeta,
     rng: Rng,
+    before: PlayerState,
     *,
     layered: bool = False,
 ) -> Step:
@@ -122,6 +137,6 @@ def _key_step(
     first = first_layer_mask(assembly, gaussians, frame, exposure=state.exposure, rng=rng) if layered else None
     meta = key_meta(meta, state.exposure, anchors.origin)
     after, packet = key_state(
-        assembly, gaussians, layout, hierarchy=hierarchy, frame=frame, meta=meta, rng=rng, first=first
+        assembly, gaussians, layout, hierarchy=hierarchy, frame=frame, meta=meta, rng=rng, first=first, before=before
     )
     return Step(after, packet, "key")

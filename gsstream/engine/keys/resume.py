@@ -14,7 +14,7 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.names import without_places
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.frame0.begin import decoded_anchors, exposure_from_meta, shell_behind
+from gsstream.engine.frame0.begin import decoded_anchors, exposure_from_meta, memory_across_key, shell_behind
 from gsstream.engine.frame0.refine import SHOWN, advance_refinement, is_to_be_refined, start_refinement
 from gsstream.engine.state.stream_state import Refinement, StreamState, next_state
 from gsstream.input.recordings.base import SourceInfo
@@ -115,7 +115,7 @@ def refinement_after(assembly: Assembly, state: StreamState, tools: Tools) -> Re
 
 
 def key_state_from_player(assembly: Assembly, player: PlayerState, rng: Rng) -> StreamState:
-    """Return the encoder state right after a key packet, from the decoded packet alone (``previous`` is not set)."""
+    """Return the encoder state right after a key packet, from what was decoded (``previous`` is not set)."""
     gaussians = player.gaussians.map(torch.from_numpy)
     decoders = assembly.update.init_decoders(gaussians, rng.stream("decoders", player.frame))
     return StreamState(
@@ -126,6 +126,7 @@ def key_state_from_player(assembly: Assembly, player: PlayerState, rng: Rng) -> 
         exposure=exposure_from_meta(player.meta),
         key_frame=player.frame,
         shell=shell_behind(assembly, player),
+        motion_memory=memory_across_key(assembly, player),
     )
 
 

@@ -58,7 +58,7 @@ class PartsMethod(StreamingMethod[StreamState]):
             if runs_after_packet(self.slots.recipe.stream, state.refinement, frame):
                 return step  # no key packet is due before the last iteration of the refinement
             step = refine_first_frame(self.slots, state, step, frame=frame, tools=tools)
-        return key_packet_if_due(self.slots, step, frame, tools)
+        return key_packet_if_due(self.slots, step, frame, tools, before=state.player)
 
     def follow_up(self, state: StreamState, step: Step, frame: Frame, tools: Tools) -> Step:
         refinement = state.refinement

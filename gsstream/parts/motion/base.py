@@ -51,7 +51,8 @@ class MotionPart(Part):
                 motion named (numpy; do not change it).
             work: the frame: images, what changed, and rendering with some rows moving.
             rng: random streams by name and frame; draw from nothing else.
-            memory: what :meth:`follow` returned for the last delta packet; None before there is one.
+            memory: what :meth:`follow` returned for the last delta packet, or :meth:`across_key` for a key packet
+                since; None before there is one.
         """
 
     def follow(self, memory: Any, frame: int, before: Layout, delta: Delta, rng: Rng) -> Any:
@@ -61,10 +62,24 @@ class MotionPart(Part):
         from the arguments alone; do not change ``memory``.
 
         Arguments:
-            memory: what this returned for the delta packet before; None at the first after a key packet.
+            memory: what this returned for the delta packet before; at the first after a key packet, what
+                :meth:`across_key` returned for that.
             frame: index of the frame.
             before: the layout that ``delta`` refers to.
             delta: what the packet changes, as every player decodes it.
             rng: random streams by name and frame; draw from nothing else.
+        """
+        return None
+
+    def across_key(self, replaced: Scene, scene: Scene) -> Any:
+        """Return the state that this part keeps after a key packet inside a stream. By default a part has none.
+
+        A player that begins with the key packet does not have it: it may decide where a fit begins, never what a motion
+        is predicted from. A resumed run calls this as well, so the result follows from the arguments alone.
+
+        Arguments:
+            replaced: the decoded scene of the frame before, with its displacement and groups; its rows are in another
+                order, and some may be others.
+            scene: that of the key packet, which has neither.
         """
         return None

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, ClassVar, final
 
 import numpy as np
 from pydantic import Field
 
-from gsstream.core.changes import Motion, Scene
+from gsstream.core.changes import Displacement, Motion, Scene
 from gsstream.core.changes.motion import GroupTransforms, predict_transforms
 from gsstream.core.part import PartConfig
 from gsstream.core.picture_size import enlargement
 from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray
+from gsstream.parts.motion.across_key import displacement_across_key
 from gsstream.parts.motion.base import MotionPart, MotionTraits
 from gsstream.parts.motion.groups import changed_groups, known_groups
 from gsstream.parts.motion.newton import BodySettings, Damping, fit_transforms_newton
@@ -24,6 +26,8 @@ BRIGHTNESS_BINS = 2
 DAMPING = 0.1
 #: Curvature that draws a group to its body, per pixel^2.
 BODY_HOLD = 500.0
+#: Times as many passes in a frame before which nothing moved, as the first and one after a key packet.
+FROM_REST = 2
 #: Longest step of a group, pixels at a width of 320.
 LONGEST = 0.5
 
@@ -35,7 +39,8 @@ class Rigid(MotionPart):
     A few passes over the training cameras move the groups' six numbers each, by damped Gauss-Newton steps after every
     view; only the Gaussians of groups that lie in what changed are rendered anew. After the first pass neighbouring
     groups whose motions agree are joined to bodies, which hold their groups from then on. A group that ends within
-    ``least`` pixels of where it stood is left alone.
+    ``least`` pixels of where it stood is left alone. After a key packet a fit begins where the scene before that was
+    heading, while the motion is coded as one from rest.
     """
 
     class Config(PartConfig):
@@ -45,7 +50,11 @@ class Rigid(MotionPart):
         )
         share: float = Field(default=0.5, ge=0, le=1, description="share of a group's Gaussians that must lie there")
         epochs: int = Field(
-            default=2, ge=1, le=100, description="passes over the training cameras; a hurried frame makes its share"
+            default=2,
+            ge=1,
+            le=100,
+            description="passes over the training cameras, twice as many where nothing moved in the frame before; a "
+            "hurried frame makes its share",
         )
         hold: float = Field(
             default=40.0, gt=0, le=1e6, description="curvature that holds every group back besides, per pixel^2"
@@ -74,8 +83,13 @@ class Rigid(MotionPart):
         # angle a moves a point by a * cell / 2 = tan(a / 2) * cell. The scene changes little between key packets, so a
         # pixel is measured once, when its groups are formed.
         unit = np.array([groups.cell / side] * 3 + [1 / side] * 3)
-        start = predict_transforms(scene, groups, able.astype(np.uint8), predicted=True)
-        found = self._fitted(work, start, unit, rng)
+        start = begin = predict_transforms(scene, groups, able.astype(np.uint8), predicted=True)
+        if isinstance(memory, Displacement):
+            begin = predict_transforms(
+                replace(scene, displacement=memory), groups, able.astype(np.uint8), predicted=True
+            )
+        passes = self.config.epochs * (FROM_REST if scene.displacement is None else 1)
+        found = self._fitted(work, begin, unit, passes=passes, rng=rng)
         step = (config.step * unit).astype(np.float32).astype(np.float64)
         predicted = np.concatenate([start.translation, start.rotation], 1)
         symbols = np.rint((found - predicted) / step).astype(np.int32)
@@ -93,7 +107,9 @@ class Rigid(MotionPart):
             ),
         )
 
-    def _fitted(self, work: FitContext, start: GroupTransforms[FloatArray], unit: FloatArray, rng: Rng) -> FloatArray:
+    def _fitted(
+        self, work: FitContext, start: GroupTransforms[FloatArray], unit: FloatArray, passes: int, rng: Rng
+    ) -> FloatArray:
         """[K, 6] shift and turn of the groups that explain the images best."""
         config, cameras = self.config, work.cameras
         # The part of noise in a sum of so many values grows as the root of their number.
@@ -102,8 +118,11 @@ class Rigid(MotionPart):
             work,
             start,
             unit,
-            iterations=work.scaled(config.epochs * len(cameras)),
+            iterations=work.scaled(passes * len(cameras)),
             order=rng.numpy("motion", work.index),
             damping=Damping(DAMPING, config.hold, LONGEST * enlargement(cameras.width)),
             settings=BodySettings(most, BODY_HOLD),
         )
+
+    def across_key(self, replaced: Scene, scene: Scene) -> Displacement | None:
+        return displacement_across_key(replaced, scene)

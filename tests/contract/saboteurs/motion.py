@@ -76,6 +76,15 @@ class Own(Base):
         return np.array([CALLS["own"]])
 
 
+@spoils("check_motion_across_key")
+class Counting(Base):
+    """Keeps across a key packet how often it was called."""
+
+    def across_key(self, replaced: Any, scene: Any) -> Any:
+        CALLS["own"] += 1
+        return np.array([CALLS["own"]])
+
+
 @spoils("check_motion_leaves_unchanged")
 class Sweeping(Base):
     """Moves everything as soon as anything changes."""

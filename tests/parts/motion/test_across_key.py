@@ -1,0 +1,116 @@
+"""How a scene was moving before a key packet: said of the rows of the key packet, and where a fit begins."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gsstream.core.changes import Displacement, Layout, Scene, apply_delta
+from gsstream.core.changes.delta import Delta
+from gsstream.core.changes.motion import groups_for
+from gsstream.parts.motion.across_key import displacement_across_key
+from gsstream.parts.motion.rigid import Rigid
+from gsstream.testing import motion as bodies
+from gsstream.testing.cases import scene as blobs
+
+CELL, BINS = 0.5, 2
+
+
+def moved_scene(number: int, seed: int = 0, *, displaced: np.ndarray | None = None) -> Scene:
+    """A scene whose rows were displaced by the last frame, each by its own vector unless they are given."""
+    rng = np.random.default_rng(seed)
+    means = torch.from_numpy(rng.normal(0, 1, (number, 3)).astype(np.float32))
+    scene = Scene(blobs(means, seed=seed).map(torch.Tensor.numpy), Layout.flat(number, 1.0))
+    translation = rng.normal(0, 0.1, (number, 3)).astype(np.float32) if displaced is None else displaced
+    turn = rng.normal(0, 0.05, (number, 3)).astype(np.float32)
+    scene = replace(scene, groups=groups_for(scene, CELL, BINS))
+    return replace(scene, displacement=Displacement(np.arange(number), translation, turn))
+
+
+def key_of(scene: Scene, order: np.ndarray) -> Scene:
+    """The scene of a frame later, as a key packet in another order of rows has it: nothing of what was before."""
+    moved = scene.displacement
+    means = scene.gaussians.means.copy()
+    means[moved.rows] += moved.translation
+    return Scene(replace(scene.gaussians, means=means).rows(order), Layout.flat(len(order), 1.0))
+
+
+@pytest.mark.parametrize("number", [1, 7, 200])
+def test_every_row_has_the_mean_of_what_is_bound_for_its_cell_and_shade(number: int) -> None:
+    """The reference goes row by row."""
+    before = moved_scene(number)
+    order = np.random.default_rng(5).permutation(number)
+    key = key_of(before, order)
+    found = displacement_across_key(before, key)
+    assert found is not None
+    assert found.rows.tolist() == list(range(number))
+    group = groups_for(key, CELL, BINS).group_of
+    for row in range(number):
+        mates = order[group == group[row]]
+        for got, given in (
+            (found.translation, before.displacement.translation),
+            (found.rotation, before.displacement.rotation),
+        ):
+            assert got[row] == pytest.approx(given[mates].astype(np.float64).mean(0), rel=1e-5, abs=1e-7)
+
+
+def test_rows_that_none_is_bound_for_are_not_listed() -> None:
+    before = moved_scene(60)
+    still = replace(before, displacement=Displacement(*(value[:20] for value in _fields(before.displacement))))
+    key = key_of(still, np.arange(60))
+    found = displacement_across_key(still, key)
+    group = groups_for(key, CELL, BINS).group_of
+    assert found is not None
+    assert found.rows.tolist() == [row for row in range(60) if group[row] in set(group[:20].tolist())]
+    assert 20 <= len(found.rows) < 60, "some are listed for their neighbours, others not at all"
+
+
+@pytest.mark.parametrize("without", ["displacement", "groups"])
+def test_a_scene_that_did_not_move_hands_nothing_on(without: str) -> None:
+    before = moved_scene(5)
+    assert displacement_across_key(replace(before, **{without: None}), key_of(before, np.arange(5))) is None
+
+
+def test_places_far_outside_the_grid_are_places_too() -> None:
+    """Cells beyond the grid are one cell, here as where groups are formed."""
+    far = np.full((4, 3), 1e30, np.float32)
+    found = displacement_across_key(moved_scene(4, displaced=far), key_of(moved_scene(4, displaced=far), np.arange(4)))
+    assert found is not None
+    assert np.isfinite(found.translation).all()
+
+
+def test_a_fast_body_is_found_after_a_key_packet_where_it_is_found_before_one() -> None:
+    """Bodies of six pixels that move by nine a frame: too far for a fit from rest, not for one that knows of them."""
+    part, shift = Rigid(), bodies.shifted((9.0, 0.0, 0.0), (0.0, -8.0, 0.0))
+    before = bodies.two_bodies()
+    groups = groups_for(before, 0.6, BINS)
+    moving = replace(before, groups=groups, displacement=Displacement(np.arange(len(shift)), shift, 0 * shift))
+    order = np.concatenate([np.random.default_rng(1).permutation(40), 40 + np.random.default_rng(2).permutation(40)])
+    key = key_of(moving, order)
+    wanted = key.gaussians.means + shift[order]
+
+    def pixels_off(memory: Displacement | None) -> float:
+        found = bodies.after_motion(part, key, shift[order], memory=memory)
+        return float(np.abs((found - wanted).reshape(2, 40, 3).mean(1)).max()) * bodies.PIXELS
+
+    assert pixels_off(part.across_key(moving, key)) < 0.5
+    assert pixels_off(None) > 2.0, "the case asks for what the part keeps"
+
+
+def test_a_player_that_begins_with_the_key_packet_decodes_the_same_motion() -> None:
+    """What is kept decides where the fit begins, and nothing that a player would have to know."""
+    part, shift = Rigid(), bodies.shifted((3.0, 0.0, 0.0), (0.0, 2.0, 0.0))
+    key = bodies.two_bodies()
+    kept = Displacement(np.arange(len(shift)), shift, 0 * shift)
+    _, work, rng = bodies._work(key, shift, everywhere=False)
+    motions = part.propose(key, work, rng, kept)
+    assert motions
+    after = apply_delta(key, Delta(motions)).gaussians.means
+    assert np.abs(after - key.gaussians.means - shift).max() * bodies.PIXELS < 0.5
+
+
+def _fields(displacement: Displacement) -> tuple[np.ndarray, ...]:
+    return displacement.rows, displacement.translation, displacement.rotation

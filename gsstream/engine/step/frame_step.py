@@ -153,9 +153,10 @@ def candidates(
 def select(assembly: Assembly, work: EngineContext, hierarchy: Hierarchy, scope: Scope) -> Selected:
     """Return what confidence, propagation and gate choose; none of them is called in a frame without a residual.
 
-    A Gaussian takes part when it is seen in a changed tile of some training view, when its centre lies in or beside
-    changed tiles in enough of the views that it projects into, and when its gate may open. Everything else is frozen:
-    it is neither projected nor optimised nor sent.
+    A Gaussian takes part when it is seen in a changed tile of some training view, when its centre and both ends of its
+    longest axis lie in or beside changed tiles in enough of the views that they project into, and when its gate may
+    open: one that reaches beyond what changed could follow the change only by spoiling what stands still. Everything
+    else is frozen: it is neither projected nor optimised nor sent.
     """
     if scope is Scope.NONE:
         nothing = work.gaussians.means.new_zeros(0, dtype=torch.int64)
@@ -163,7 +164,8 @@ def select(assembly: Assembly, work: EngineContext, hierarchy: Hierarchy, scope:
     seen = work.everywhere() if scope is Scope.ALL else work
     confidence = assembly.propagation.propagate(assembly.confidence.estimate(seen), hierarchy)
     logits = assembly.gate.init(confidence)
-    able, threshold = seen.changed_rows(CHANGE_VOTES), assembly.recipe.stream.active_threshold
+    able = seen.reaching_changes(seen.changed_rows(CHANGE_VOTES), CHANGE_VOTES)
+    threshold = assembly.recipe.stream.active_threshold
     return Selected(candidates(able, assembly.gate.open_probability(logits), hierarchy, threshold), logits)
 
 

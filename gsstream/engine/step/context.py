@@ -143,7 +143,7 @@ class EngineContext:
             return ~self.shell_rows
         return self._change.rows(self.gaussians.means, self.cameras, self.session, min_votes) & ~self.shell_rows
 
-    def reaching_changes(self, able: torch.Tensor, min_votes: float) -> torch.Tensor:
+    def within_changes(self, able: torch.Tensor, min_votes: float) -> torch.Tensor:
         """Return which of the rows ``able`` [N] bool end in what changed, one sigma along their longest axis.
 
         Both ends must lie in or beside changed tiles in at least this share of the views that they project into.

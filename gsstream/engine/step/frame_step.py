@@ -134,6 +134,8 @@ def with_growth(assembly: Assembly, state: StreamState, delta: Delta, work: Engi
 #: many cameras from making everything a candidate: a wall is behind a moving person in some view, but only what moves
 #: lies in changed tiles in most of them (the idea of a visual hull).
 CHANGE_VOTES = 0.75
+#: The same for both ends of its longest axis: three quarters for them, too, would keep out what is large and moves.
+REACH_VOTES = 0.25
 
 
 class Selected(NamedTuple):
@@ -155,8 +157,8 @@ def select(assembly: Assembly, work: EngineContext, hierarchy: Hierarchy, scope:
 
     A Gaussian takes part when it is seen in a changed tile of some training view, when its centre and both ends of its
     longest axis lie in or beside changed tiles in enough of the views that they project into, and when its gate may
-    open: one that reaches beyond what changed could follow the change only by spoiling what stands still. Everything
-    else is frozen: it is neither projected nor optimised nor sent.
+    open. One that reaches beyond what changed stays, since it is seen where nothing changed. Everything else is frozen: it
+    is neither projected nor optimised nor sent.
     """
     if scope is Scope.NONE:
         nothing = work.gaussians.means.new_zeros(0, dtype=torch.int64)
@@ -164,7 +166,7 @@ def select(assembly: Assembly, work: EngineContext, hierarchy: Hierarchy, scope:
     seen = work.everywhere() if scope is Scope.ALL else work
     confidence = assembly.propagation.propagate(assembly.confidence.estimate(seen), hierarchy)
     logits = assembly.gate.init(confidence)
-    able = seen.reaching_changes(seen.changed_rows(CHANGE_VOTES), CHANGE_VOTES)
+    able = seen.within_changes(seen.changed_rows(CHANGE_VOTES), REACH_VOTES)
     threshold = assembly.recipe.stream.active_threshold
     return Selected(candidates(able, assembly.gate.open_probability(logits), hierarchy, threshold), logits)
 

@@ -157,8 +157,8 @@ def select(assembly: Assembly, work: EngineContext, hierarchy: Hierarchy, scope:
 
     A Gaussian takes part when it is seen in a changed tile of some training view, when its centre and both ends of its
     longest axis lie in or beside changed tiles in enough of the views that they project into, and when its gate may
-    open. One that reaches beyond what changed stays, since it is seen where nothing changed. Everything else is frozen: it
-    is neither projected nor optimised nor sent.
+    open. One that reaches beyond what changed stays, since it is seen where nothing changed. Everything else is frozen:
+    neither projected nor optimised nor sent.
     """
     if scope is Scope.NONE:
         nothing = work.gaussians.means.new_zeros(0, dtype=torch.int64)

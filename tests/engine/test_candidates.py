@@ -23,6 +23,7 @@ from gsstream.parts.backend.change import Change
 from gsstream.parts.backend.reference import ReferenceRenderer
 from gsstream.parts.gate.base import GateSampler
 from gsstream.parts.regularizer.none import NoRegularizer
+from gsstream.parts.render.activations import rotation_matrices
 from gsstream.parts.render.images import TILE
 from gsstream.parts.render.session import RenderSession
 from gsstream.testing.cases import BLACK, scene
@@ -92,6 +93,36 @@ def test_changed_rows_are_those_seen_in_changed_tiles_with_enough_votes(
     ]
     assert found.tolist() == expected
     assert session.asked == changed
+
+
+@settings(max_examples=40, deadline=None)
+@given(views=st.integers(1, 3), seed=st.integers(0, 999), share=st.sampled_from([0.1, 0.4]))
+def test_the_ends_of_a_gaussian_are_those_of_its_longest_axis(views: int, seed: int, share: float) -> None:
+    """The reference takes the axis from the covariance, so it does not know which scale is which."""
+    rng = np.random.default_rng(seed)
+    means = torch.from_numpy(rng.uniform([-2, -1.5, 1], [2, 1.5, 5], (20, 3)))
+    scales, quats = torch.from_numpy(rng.normal(-1, 1, (20, 3))), torch.from_numpy(rng.normal(0, 1, (20, 4)))
+    some = scene(means, scales=scales, quats=quats)
+    tiles = torch.from_numpy(rng.random((views, -(-HEIGHT // TILE), -(-WIDTH // TILE))) < share)
+    found = Change(tiles, HEIGHT, WIDTH).votes_of_ends(some, rig(views))
+    for row in range(20):
+        turn = rotation_matrices(quats[row : row + 1])[0].numpy()
+        variance, axes = np.linalg.eigh(turn @ np.diag(np.exp(2 * scales[row].numpy())) @ turn.T)
+        reach = np.sqrt(variance[-1]) * axes[:, -1]
+        ends = [votes_by_hand(means[row].numpy() + side * reach, tiles, rig(views)) for side in (1, -1)]
+        assert float(found[row]) == pytest.approx(min(ends)), row
+
+
+def test_a_gaussian_that_reaches_far_beyond_what_changed_takes_no_part() -> None:
+    """A round one of the same place does, and so does a long one that ends in what changed."""
+    tiles = torch.zeros(3, 3, 4, dtype=torch.bool)
+    tiles[:, 1, 1] = True
+    long = torch.tensor([[0.0, 3.0, 0.0], [-4.0, -4.0, -4.0], [0.0, -1.5, 0.0]])
+    votes = Change(tiles, HEIGHT, WIDTH).votes_of_ends(
+        scene(torch.tensor([[-0.1, 0.0, 3.0]] * 3), scales=torch.where(long == 0, torch.tensor(-4.0), long)), rig(3)
+    )
+    assert votes[0] == 0
+    assert votes[1:].tolist() == [1, 1]
 
 
 @pytest.mark.parametrize("number", [0, 1])

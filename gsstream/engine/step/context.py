@@ -20,7 +20,6 @@ from gsstream.input.seeds.shell import in_shell
 from gsstream.metrics.noise import noise_sigma
 from gsstream.parts.backend.change import Change
 from gsstream.parts.backend.row_optimiser import RowOptimiser
-from gsstream.parts.render.activations import activate_scales, rotation_matrices
 from gsstream.parts.render.session import RenderSession
 from gsstream.parts.render.target import ViewTarget
 from gsstream.parts.render.wrt import G, LossAndGrad, Wrt
@@ -144,18 +143,12 @@ class EngineContext:
         return self._change.rows(self.gaussians.means, self.cameras, self.session, min_votes) & ~self.shell_rows
 
     def within_changes(self, able: torch.Tensor, min_votes: float) -> torch.Tensor:
-        """Return which of the rows ``able`` [N] bool end in what changed, one sigma along their longest axis.
-
-        Both ends must lie in or beside changed tiles in at least this share of the views that they project into.
-        """
+        """Return which of the rows ``able`` [N] bool have at least this share of votes at both ends."""
         if self._change is None:
             return able
         rows = able.nonzero()[:, 0]
-        some = self.gaussians.map(lambda value: value[rows])
-        longest, axis = activate_scales(some.scales).max(1)
-        reach = rotation_matrices(some.quats)[torch.arange(len(rows), device=rows.device), :, axis] * longest[:, None]
-        votes = self._change.votes(torch.cat([some.means + reach, some.means - reach]), self.cameras)
-        return able.index_put((rows,), (votes >= min_votes).view(2, -1).all(0))
+        votes = self._change.votes_of_ends(self.gaussians.map(lambda value: value[rows]), self.cameras)
+        return able.index_put((rows,), votes >= min_votes)
 
     def narrow(self, rows: torch.Tensor) -> None:
         self._session = self.session_for(rows)

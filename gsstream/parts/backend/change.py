@@ -16,8 +16,10 @@ import torch
 from torch.nn.functional import max_pool2d, pad
 
 from gsstream.core.cameras import Cameras
+from gsstream.core.gaussians import Gaussians
 from gsstream.core.median import tensor_median
 from gsstream.metrics.noise import MAD_TO_SIGMA
+from gsstream.parts.render.activations import activate_scales, rotation_matrices
 from gsstream.parts.render.images import TILE, float_image, spread_to_pixels
 from gsstream.parts.render.session import RenderSession
 
@@ -105,6 +107,14 @@ class Change:
             inside, marked = self._found(means, cameras, views)
             seen, hits = seen + inside.sum(0), hits + (inside & marked).sum(0)
         return hits / seen.clamp_min(1)
+
+    def votes_of_ends(self, gaussians: Gaussians[torch.Tensor], cameras: Cameras) -> torch.Tensor:
+        """Return [N]: the smaller :meth:`votes` of a Gaussian's two ends, one sigma along its longest axis."""
+        sigma, axis = activate_scales(gaussians.scales).max(1)
+        along = axis[:, None, None].expand(-1, 3, 1)
+        reach = rotation_matrices(gaussians.quats).gather(2, along)[..., 0] * sigma[:, None]
+        ends = torch.cat([gaussians.means + reach, gaussians.means - reach])
+        return self.votes(ends, cameras).view(2, -1).amin(0)
 
     def _found(self, means: torch.Tensor, cameras: Cameras, views: slice) -> tuple[torch.Tensor, torch.Tensor]:
         """[V, N] bool: whether centres project into these views, and whether in or beside a tile that changed."""

@@ -26,14 +26,15 @@ KINDS = (
 #: Those of torch, and those in Triton, on a GPU where there is one, else in Triton's interpreter.
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 FUSED = load_fused(DEVICE.type) if importlib.util.find_spec("triton") else None
-KERNELS = [pytest.param(IN_TORCH, id="torch")]
-KERNELS += [] if FUSED is None else [pytest.param(FUSED.tiles, id="triton")]
+KERNELS = ["torch", "triton"] if importlib.util.find_spec("triton") else ["torch"]
 
 
 @pytest.fixture(params=KERNELS)
 def kernels(request: pytest.FixtureRequest) -> TileKernels:
-    found: TileKernels = request.param
-    return found
+    if request.param == "torch":
+        return IN_TORCH
+    assert FUSED is not None, "Triton is here and its kernels are not used: the warning of load_fused says why"
+    return FUSED.tiles
 
 
 @dataclass(frozen=True)

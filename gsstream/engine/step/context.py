@@ -146,6 +146,8 @@ class EngineContext:
         """Return which of the rows ``able`` [N] bool have at least this share of votes at both ends."""
         if self._change is None:
             return able
+        if able.device.type != "cpu":  # a GPU would be waited for to know how many they are
+            return able & (self._change.votes_of_ends(self.gaussians, self.cameras) >= min_votes)
         rows = able.nonzero()[:, 0]
         votes = self._change.votes_of_ends(self.gaussians.map(lambda value: value[rows]), self.cameras)
         return able.index_put((rows,), votes >= min_votes)

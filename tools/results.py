@@ -65,6 +65,8 @@ NUMBER = re.compile(
     r"(?P<value>[^<]*)<!-- end -->"
 )
 
+#: Begins the names of quantities of the camera that has least of them in the mean over frames.
+WORST = "worst_"
 #: Begins the names of the tables that the paper prints, which the lab has.
 PRINTED = "paper-"
 
@@ -85,7 +87,7 @@ def rows_of_sweep(folder: Path, commit: str, at: Sequence[int] = (), curve: bool
     for group in data.groups:
         for run in group.runs:
             alone = {f"frame_{t}": mean_of_views([run.row["frames"][t]], "psnr_changed_seen") for t in at}
-            found = {**run.values, **alone}
+            found = {**run.values, **alone, **worst_camera(run, "psnr_changed_seen")}
             values = {key: float(f"{value:.6g}") for key, value in found.items() if math.isfinite(value)}
             facts = data.table.machines[run.row["machine"]]["facts"]
             origin = {"commit": commit, "recipe": run.row["recipe"], "date": run.row["date"]}
@@ -107,6 +109,16 @@ def rows_of_sweep(folder: Path, commit: str, at: Sequence[int] = (), curve: bool
                 }
             )
     return rows
+
+
+def worst_camera(run: Run, name: str) -> dict[str, float]:
+    """Return the least mean of a quantity over the frames after the first, of any test camera, if there are several."""
+    by_camera: dict[str, list[float]] = {}
+    for frame in run.row["frames"][1:]:
+        for camera, value in (frame.get(name) or {}).items():
+            if value is not None:
+                by_camera.setdefault(camera, []).append(value)
+    return {WORST + name: min(map(statistics.fmean, by_camera.values()))} if len(by_camera) > 1 else {}
 
 
 def _phases(run: Run) -> dict[str, float]:
@@ -159,15 +171,15 @@ def read_rows(name: str, folder: Path) -> list[Row]:
 
 def title_of(key: str) -> str:
     """Return the head of a column: of a quantity, its title; of anything else, its key in words."""
-    if key in BY_KEY:
-        return str(BY_KEY[key].title)
+    if (known := key.removeprefix(WORST)) in BY_KEY:
+        return f"{BY_KEY[known].title}{', worst camera' * key.startswith(WORST)}"
     return f"{key.removeprefix('ms_')}, ms" if key.startswith("ms_") else key.replace("_", " ")
 
 
 def entry(key: str, values: Sequence[Any]) -> str:
     """Return a cell of a table: mean and standard deviation over seeds; other facts as they stand."""
-    if key in BY_KEY:
-        return str(cell(key, statistics.fmean(values), spread(values)))
+    if (known := key.removeprefix(WORST)) in BY_KEY:
+        return str(cell(known, statistics.fmean(values), spread(values)))
     if key.startswith("ms_"):
         mean = statistics.fmean(values)
         return "-" if math.isnan(mean) else f"{mean:.0f}"

@@ -11,6 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+from gsstream_lab.report.groups import Run
 
 from gsstream.core.errors import InputError
 from gsstream.encode import open_recording
@@ -29,6 +30,8 @@ from tools.results import (
     rows_of_sweep,
     run,
     table_of,
+    title_of,
+    worst_camera,
 )
 
 RUN = {"scene": "a", "name": "edge", "seed": 0, "frames": 3, "psnr": 30.0, "kb": 2.0}
@@ -168,6 +171,15 @@ def test_what_changed_in_a_frame_and_is_seen_is_that_of_an_evaluation(tmp_path: 
     assert row["ms_decode"] > 0
     assert row["frame_0_of"] == row["name"]
     assert row["psnr_seen"] == pytest.approx(sum(view["psnr_seen"] for view in views[1:]) / 5, rel=1e-5)
+
+
+def test_the_worst_camera_is_that_of_the_mean_over_frames() -> None:
+    """Not the mean over frames of the worst in each; the first frame is not among them."""
+    frames = [{"p": {"a": 0.0, "b": 50.0}}, {"p": {"a": 30.0, "b": 20.0}}, {"p": {"a": 10.0, "b": 24.0}}]
+    made = Run("x", 0, {"frames": [*frames, {"p": {"a": None, "b": 25.0}}]}, (), {})
+    assert worst_camera(made, "p") == {"worst_p": 20.0}
+    assert worst_camera(made, "q") == {}
+    assert title_of("worst_psnr_changed_seen") == f"{title_of('psnr_changed_seen')}, worst camera"
 
 
 def test_rows_taken_twice_keep_the_commit_that_ran_them() -> None:

@@ -341,9 +341,10 @@ def test_options_in_sentences_exist(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=where)
 def test_recipe_keys_exist(page: Path) -> None:
-    pieces = [*INLINE.findall(prose(page)), *shell_lines(page)]
+    blocks = FENCE.findall(page.read_text(encoding="utf-8"))
+    pieces = [*INLINE.findall(prose(page)), *shell_lines(page), *(body for kind, body in blocks if kind == "yaml")]
     unknown = {key for piece in pieces for key in keys_named(piece)} - recipe_keys()
-    code = "".join(body for language, body in FENCE.findall(page.read_text(encoding="utf-8")) if language == "python")
+    code = "".join(body for kind, body in blocks if kind == "python")
     own = set(re.findall(r"^ +(\w+): ", code, re.MULTILINE))  # settings of a part that the page shows how to write
     check(sorted(key for key in unknown if key.rpartition(".")[2] not in own))
 

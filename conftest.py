@@ -8,18 +8,26 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from hypothesis import settings
 
-# Beside other workers a test that spreads over all cores only makes everybody wait. Tests of threads set their numbers
-# themselves.
+# Beside other workers a test that spreads over all cores only makes everybody wait, and threads of torch that wait for
+# one another keep a core busy. Libraries read these when they are loaded, so that nothing above may import numpy or
+# torch. Tests of threads set their numbers themselves.
 if "PYTEST_XDIST_WORKER" in os.environ:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "GSSTREAM_THREADS"):
         os.environ.setdefault(name, "1")
 
+
+def sees_gpu() -> bool:
+    """Return whether torch sees a GPU."""
+    import torch
+
+    return torch.cuda.is_available()
+
+
 # Kernels in Triton are run by its interpreter where torch sees no GPU. Triton reads this when it is imported, which
 # torch may do at any time.
-if not torch.cuda.is_available():
+if not sees_gpu():
     os.environ.setdefault("TRITON_INTERPRET", "1")
 
 # What pytest collects stays until the end, so Python's collector of garbage begins after it and never goes through it:

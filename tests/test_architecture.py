@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import io
+import os
 import subprocess
 import sys
 import tokenize
@@ -11,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 from pydantic import BaseModel
 
 from tools.reference.pages import PAGES, write
@@ -145,6 +147,12 @@ def test_the_requirements_cover_every_distribution_of_this_repository() -> None:
             name, equals, _ = line.partition("==")
             assert equals, f"{line} is not pinned"
             assert f"`{name}`" in documented, f"docs/dependencies.md does not say why {name}"
+
+
+@pytest.mark.skipif("PYTEST_XDIST_WORKER" not in os.environ, reason="runs in no worker, which keeps to one thread")
+def test_a_worker_keeps_to_one_thread() -> None:
+    """Libraries read the number when they are loaded: set after that, it would have no effect and nobody would see."""
+    assert torch.get_num_threads() == int(os.environ["OMP_NUM_THREADS"])
 
 
 def test_the_lists_of_conftest_name_files_that_exist() -> None:

@@ -69,7 +69,7 @@ def test_a_disturbed_run_is_evaluated_on_what_it_saw(tmp_path: Path, capsys: pyt
 
 
 LEAKING: dict[str, Any] = {
-    "source": "synthetic:frames=2&views=3&width=64&height=48&supersample=1",
+    "source": "synthetic:frames=2&views=3&width=32&height=24&supersample=1",
     "first_frame__points": "sweep",
     "stream__epochs": 1,
 }

@@ -6,10 +6,11 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
+import torch
 from flow_runs import arguments, demo_copy
 
 from gsstream.cli.main import run_command
@@ -19,6 +20,7 @@ from gsstream.encode import open_recording
 from gsstream.engine.run.measure import HeldOut
 from gsstream.input.prepare.pose_checks import check_poses, check_swapped, first_look
 from gsstream.input.recordings.base import Source
+from gsstream.input.seeds import sweep
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 #: Poses as others write them, and what undoes it.
@@ -74,6 +76,23 @@ def test_a_convention_is_told_by_one_frame(frame: Frame, name: str) -> None:
     found = check_poses(replace(frame, cameras=replace(frame.cameras, viewmats=poses)))
     assert [(finding.code, finding.severity) for finding in found] == [("axes", "error")]
     assert cure in found[0].message
+
+
+def test_each_of_its_small_operations_is_done_by_one_thread(frame: Frame, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Others would only wait for it, and keep their processors busy for many times as long as the work takes."""
+    seen, cost, before = [], sweep._matching_cost, torch.get_num_threads()
+
+    def watched(*given: Any, **named: Any) -> Any:
+        seen.append(torch.get_num_threads())
+        return cost(*given, **named)
+
+    monkeypatch.setattr(sweep, "_matching_cost", watched)
+    torch.set_num_threads(2)
+    try:
+        assert check_poses(frame) == []
+        assert (set(seen), torch.get_num_threads()) == ({1}, 2)
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -100,8 +100,8 @@ def agreements(
     grey = torch.from_numpy(np.ascontiguousarray(images @ _GREY))
     partners = neighbour_views(cameras, settings.neighbours)
     near_far = depth_range(cameras)
-    shares = np.full(len(views), np.nan)
-    for row, view in enumerate(views):
+
+    def one(view: int) -> float:
         root = np.linspace(near_far[view, 1] ** -0.5, near_far[view, 0] ** -0.5, settings.planes)
         inverse = (root**2).astype(np.float32)
         cost = _matching_cost(
@@ -109,9 +109,10 @@ def agreements(
         ).min(0)
         variance = _mean_and_variance(grey[view][None, None], settings.windows[0])[1][0, 0].numpy()
         textured = variance > (3 * settings.noise) ** 2
-        if textured.any():
-            shares[row] = float((cost[textured] < limit).mean())
-    return shares
+        return float((cost[textured] < limit).mean()) if textured.any() else np.nan
+
+    with one_thread_each(settings.workers) as pool:
+        return np.array(list(pool.map(one, views)), np.float64)
 
 
 def _matching_cost(

@@ -85,12 +85,17 @@ $(BIN)/python:
 	@$(PYTHON) -m venv $(VENV) || { \
 	  echo "Could not make a virtual environment (on Debian and Ubuntu: apt install python3-venv)."; rm -rf $(VENV); exit 1; }
 
+# Plugins of pure Python are built by the hatchling that is installed by then. For each that is built in an environment of
+# its own, pip installs one there, which takes three times as long as the rest.
 $(INSTALLED): $(BIN)/python
 	@echo 'int main() { return []<class T>(T x) { return x; }(0); }' | $(CXX) -std=c++20 -x c++ -fsyntax-only - 2>/dev/null || { \
 	  echo "gsstream builds its renderer with a C++20 compiler; '$(CXX)' is missing or too old."; \
 	  echo "Install one (on Debian and Ubuntu: apt install g++) or name another: make CXX=clang++"; exit 1; }
 	@rm -f $(VENV)/.installed-* $(VENV)/.built-*
-	CXX=$(CXX) $(BIN)/python -m pip install --disable-pip-version-check -r requirements.txt
+	@grep -v '^-e plugins/' requirements.txt > $(VENV)/first.txt
+	@grep '^-e plugins/' requirements.txt | grep -v cpu_render > $(VENV)/pure.txt
+	CXX=$(CXX) $(BIN)/python -m pip install --disable-pip-version-check -r $(VENV)/first.txt -e plugins/cpu_render
+	$(BIN)/python -m pip install --disable-pip-version-check --no-build-isolation -r $(VENV)/pure.txt
 	@touch $(INSTALLED) $(BUILT)
 
 # Only the native sources changed: build the renderer again and leave everything else alone.

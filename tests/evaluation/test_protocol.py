@@ -97,7 +97,8 @@ def test_a_run_and_its_pictures_are_measured_by_the_same_protocol(
 ) -> None:
     run, pictures = tmp_path / "run", tmp_path / "pictures"
     command = ["run", "--method", "hold", "--source", SOURCE, "--out", str(run), "--quiet", "--no-pictures"]
-    assert run_command([*command, "--set", "first_frame.max_iterations=3"]) == 0
+    small = ("--set", "first_frame.max_iterations=3", "--set", "first_frame.points=recording")
+    assert run_command([*command, *small]) == 0
     assert run_command(["evaluate", str(run), "--protocol", "n3dv"]) == 2
     assert "pictures: expected 1352 x 1014, got 32 x 24" in capsys.readouterr().err
     assert run_command(["evaluate", str(run), "--json"]) == 0

@@ -208,7 +208,7 @@ def test_evaluation_has_lpips_only_when_it_was_measured(tmp_path):
 def small_run(tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "small"
     source = "synthetic:frames=2&views=2&width=40&height=30"
-    tiny = ["--set", "first_frame.max_iterations=2"]
+    tiny = ["--set", "first_frame.max_iterations=2", "--set", "first_frame.points=recording"]
     run = ["run", "--source", source, "--out", str(out), "--method", "dense", *tiny, "--quiet", "--no-pictures"]
     assert run_command(run) == 0
     return out

@@ -27,7 +27,7 @@ def pictures(encoded: list[str], width: int, height: int) -> list[np.ndarray]:
 
 def test_pictures_of_a_run_are_those_of_the_python_player(tmp_path):
     source = "synthetic:frames=6&views=3&width=64&height=48"
-    settings = ["--set", "first_frame.max_iterations=60"]
+    settings = ["--set", "first_frame.max_iterations=60", "--set", "first_frame.points=recording"]
     run = ["run", "--source", source, "--out", str(tmp_path / "run"), "--method", "s2gs-fast", *settings]
     assert run_command([*run, "--quiet", "--no-pictures"]) == 0
     stream = tmp_path / "run" / "stream.gss"

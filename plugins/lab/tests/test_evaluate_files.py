@@ -13,7 +13,7 @@ from gsstream.cli.main import run_command
 from gsstream.core.errors import InputError
 
 SOURCE = "synthetic:frames=3&views=3&width=64&height=48&supersample=1"
-SMALL = ("max_iterations=5", "max_points=200")
+SMALL = ("max_iterations=5", "max_points=200", "points=recording")
 
 
 @pytest.fixture(scope="module")

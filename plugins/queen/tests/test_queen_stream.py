@@ -21,6 +21,7 @@ SOURCE = "synthetic:frames=5&views=3&width=64&height=48&supersample=1"
 SETTINGS = {
     "first_frame.max_iterations": 40,
     "first_frame.max_points": 500,
+    "first_frame.points": "recording",
     "stream.epochs": 3,
     "streaming_method.growth.every": 1,
     "streaming_method.growth.grad_threshold": 1e-4,

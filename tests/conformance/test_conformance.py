@@ -172,10 +172,10 @@ def flushing(gaussians: Any, stored: Any, residual: Any) -> Any:
     return after.map(lambda a: np.where(np.abs(a) < np.finfo(np.float32).tiny, np.float32(0), a))
 
 
-MEANS, APPLY = motion._means, residual_change.apply_residual
+MEANS, APPLY = motion.group_means, residual_change.apply_residual
 WRONG = {
     "core.changes.residual.decode_residual": wide_residual,
-    "core.changes.motion._means": backwards,
+    "core.changes.motion.group_means": backwards,
     "core.changes.delta.apply_residual": sparing,
 }
 

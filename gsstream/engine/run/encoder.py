@@ -157,8 +157,9 @@ class Encoder:
             self.controller.settle(step, tools.budget, len(frame.cameras), log)
         log.set(cpu_seconds=time.process_time() - worked, peak_memory_mb=peak_memory_mb())
         self.state = step.state
-        line = {"frame": frame.index, "status": step.status, **log.entry()}
-        return EncodedFrame(step.state, step.packet, step.status, line)
+        return EncodedFrame(
+            step.state, step.packet, step.status, {"frame": frame.index, "status": step.status, **log.entry()}
+        )
 
     def resume(self, stream: Path, image: Callable[[int], Frame], last: int | None = None) -> int | None:
         """Go on after the last sound packet of a stream that this method wrote; return that frame's index.

@@ -11,7 +11,6 @@ from gsstream.core.context import RowGradient, ScreenGradient
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.log import FrameLog
-from gsstream.core.picture_size import far_weight
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.constants import DSSIM
 from gsstream.engine.fit.photometric import FrameImages, PhotometricLoss, render_exposed
@@ -137,20 +136,11 @@ class EngineContext:
         means, scales = self.gaussians.means.cpu().numpy(), self.gaussians.scales.cpu().numpy()
         return torch.from_numpy(in_shell(means, scales, self._shell)).to(self._device)
 
-    def changed_rows(self, min_votes: float) -> torch.Tensor:
+    def changed_rows(self, min_votes: float, min_votes_of_ends: float = 0.0) -> torch.Tensor:
         if self._change is None:
             return ~self.shell_rows
-        return self._change.rows(self.gaussians.means, self.cameras, self.session, min_votes) & ~self.shell_rows
-
-    def within_changes(self, able: torch.Tensor, min_votes: float) -> torch.Tensor:
-        """Return which of the rows ``able`` [N] bool have at least this share of votes at both ends."""
-        if self._change is None:
-            return able
-        if able.device.type != "cpu":  # a GPU would be waited for to know how many they are
-            return able & (self._change.votes_of_ends(self.gaussians, self.cameras) >= min_votes)
-        rows = able.nonzero()[:, 0]
-        votes = self._change.votes_of_ends(self.gaussians.map(lambda value: value[rows]), self.cameras)
-        return able.index_put((rows,), votes >= min_votes)
+        able = self._change.rows(self.gaussians.means, self.cameras, self.session, min_votes) & ~self.shell_rows
+        return self._change.within(able, self.gaussians, self.cameras, min_votes_of_ends) if min_votes_of_ends else able
 
     def narrow(self, rows: torch.Tensor) -> None:
         self._session = self.session_for(rows)
@@ -171,14 +161,6 @@ class EngineContext:
         if self._change is None or far == 1.0:
             return self.view_target(view)
         return self.view_target(view, self._change.dilated[view].float().clamp_min(far))
-
-    def residual_target(self, view: int) -> ViewTarget:
-        """Return what the residual's render of this view is compared with; the larger the picture, the less tiles away
-        from every change weigh.
-
-        :func:`gsstream.core.picture_size.far_weight` is the rule, docs/results/extremes.md what was measured.
-        """
-        return self.changed_target(view, far_weight(self.cameras.width))
 
     def on(self, gaussians: Gaussians[torch.Tensor], session: RenderSession | None = None) -> EngineContext:
         # The loss of the same images and the votes that were counted are shared, not made again.

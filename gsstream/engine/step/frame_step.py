@@ -6,6 +6,7 @@ what changed -> motion -> confidence, gates -> optimise -> growth -> code -> dec
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -15,6 +16,7 @@ from gsstream.core.deferred import deferred_checks
 from gsstream.core.frame import Frame
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.log import FrameLog
+from gsstream.core.picture_size import far_weight
 from gsstream.core.rng import Rng
 from gsstream.core.storage import packed
 from gsstream.engine.assembly.assemble import Assembly
@@ -67,7 +69,10 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
             logits=logits,
             decoders=state.decoders,
             session=work.session_for(rows),
-            target=(work.everywhere() if scope is Scope.ALL else work).residual_target,
+            # The larger the picture, the less weigh tiles away from every change (docs/results/extremes.md).
+            target=partial(
+                (work.everywhere() if scope is Scope.ALL else work).changed_target, far=far_weight(frame.cameras.width)
+            ),
             cameras=frame.cameras,
             generator=rng.stream("frame", frame.index),
             codes=scale_steps(assembly.update.codes(), budget.step_scale),
@@ -164,10 +169,8 @@ def select(assembly: Assembly, work: EngineContext, hierarchy: Hierarchy, scope:
         nothing = work.gaussians.means.new_zeros(0, dtype=torch.int64)
         return Selected(nothing, work.gaussians.means.new_zeros(hierarchy.num_nodes))
     seen = work.everywhere() if scope is Scope.ALL else work
-    confidence = assembly.propagation.propagate(assembly.confidence.estimate(seen), hierarchy)
-    logits = assembly.gate.init(confidence)
-    able = seen.within_changes(seen.changed_rows(CHANGE_VOTES), REACH_VOTES)
-    threshold = assembly.recipe.stream.active_threshold
+    logits = assembly.gate.init(assembly.propagation.propagate(assembly.confidence.estimate(seen), hierarchy))
+    able, threshold = seen.changed_rows(CHANGE_VOTES, REACH_VOTES), assembly.recipe.stream.active_threshold
     return Selected(candidates(able, assembly.gate.open_probability(logits), hierarchy, threshold), logits)
 
 

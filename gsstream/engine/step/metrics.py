@@ -24,11 +24,10 @@ def step_numbers(solution: Solution | None, candidates: int, session: RenderSess
     }
     cache = RenderCache() if session is None else session.cache_bytes()
     if cache.per_view:
-        per_pair = round(cache.per_camera_and_gaussian, 1)
         numbers["cache"] = {
             "mb": cache.total / 1e6,
             "cameras": len(cache.per_view),
-            "bytes_per_camera_and_gaussian": per_pair,
+            "bytes_per_camera_and_gaussian": round(cache.per_camera_and_gaussian, 1),
         }
     return numbers
 

@@ -13,13 +13,12 @@ from functools import cached_property
 from typing import Final
 
 import torch
-from torch.nn.functional import max_pool2d, pad
+from torch.nn.functional import max_pool2d, normalize, one_hot, pad
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.median import tensor_median
 from gsstream.metrics.noise import MAD_TO_SIGMA
-from gsstream.parts.render.activations import activate_scales, rotation_matrices
 from gsstream.parts.render.images import TILE, float_image, spread_to_pixels
 from gsstream.parts.render.session import RenderSession
 
@@ -108,13 +107,19 @@ class Change:
             seen, hits = seen + inside.sum(0), hits + (inside & marked).sum(0)
         return hits / seen.clamp_min(1)
 
-    def votes_of_ends(self, gaussians: Gaussians[torch.Tensor], cameras: Cameras) -> torch.Tensor:
-        """Return [N]: the smaller :meth:`votes` of a Gaussian's two ends, one sigma along its longest axis."""
-        sigma, axis = activate_scales(gaussians.scales).max(1)
-        along = axis[:, None, None].expand(-1, 3, 1)
-        reach = rotation_matrices(gaussians.quats).gather(2, along)[..., 0] * sigma[:, None]
-        ends = torch.cat([gaussians.means + reach, gaussians.means - reach])
-        return self.votes(ends, cameras).view(2, -1).amin(0)
+    def within(
+        self, able: torch.Tensor, gaussians: Gaussians[torch.Tensor], cameras: Cameras, min_votes: float
+    ) -> torch.Tensor:
+        """Return those of the rows ``able`` [N] bool of which both ends have at least this share of votes.
+
+        An end lies one standard deviation from the centre along the longest axis.
+        """
+        some = gaussians.rows(able.nonzero()[:, 0])
+        along, quats = one_hot(some.scales.argmax(1), 3) * some.scales.exp(), normalize(some.quats)
+        twist = 2 * torch.linalg.cross(quats[:, 1:], along)
+        reach = along + quats[:, :1] * twist + torch.linalg.cross(quats[:, 1:], twist)  # the axis, turned
+        ends = torch.cat([some.means + reach, some.means - reach])
+        return able.masked_scatter(able, (self.votes(ends, cameras) >= min_votes).view(2, -1).all(0))
 
     def _found(self, means: torch.Tensor, cameras: Cameras, views: slice) -> tuple[torch.Tensor, torch.Tensor]:
         """[V, N] bool: whether centres project into these views, and whether in or beside a tile that changed."""

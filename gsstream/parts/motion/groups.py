@@ -45,8 +45,7 @@ def changed_groups(groups: Groups, work: FitContext, votes: float, share: float)
     changed = work.changed_rows(votes).cpu().numpy()
     total = np.bincount(groups.group_of, minlength=groups.count)
     hit = np.bincount(groups.group_of[changed], minlength=groups.count)
-    still = _groups_with(groups, work.shell_rows)
-    return np.asarray((total > 0) & (hit > 0) & (hit >= share * total) & ~still)
+    return np.asarray((total > 0) & (hit > 0) & (hit >= share * total) & ~_groups_with(groups, work.shell_rows))
 
 
 def groups_of_rows(groups: Groups, rows: IntArray, shell: torch.Tensor) -> IntArray:

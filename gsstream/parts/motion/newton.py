@@ -151,8 +151,8 @@ def fit_transforms_newton(
 
     def compared(numbers: torch.Tensor, view: int, curvature: bool = False) -> LossAndGrad[torch.Tensor]:
         now = numbers * per_step
-        wrt = WrtTransforms(base, local._replace(translation=now[:, :3], rotation=now[:, 3:]), curvature)
-        return work.loss_and_grad(view, wrt, "changed")
+        moved = local._replace(translation=now[:, :3], rotation=now[:, 3:])
+        return work.loss_and_grad(view, WrtTransforms(base, moved, curvature), "changed")
 
     begin = torch.cat([local.translation, local.rotation], 1) / per_step
     if max(np.abs(start.translation).max() / unit[0], np.abs(start.rotation).max() / unit[3]) > FAR:
@@ -164,8 +164,10 @@ def fit_transforms_newton(
         if step == views and settings.most:
             descent.join_neighbours(start.center, unit, settings)
         found = compared(descent.values, int(sequence[step % views]), curvature=step < views)
-        curvature = None if found.curvature is None else found.curvature * squares * values
-        descent.step(found.grad * per_step * values, curvature)
+        descent.step(
+            found.grad * per_step * values,
+            None if found.curvature is None else found.curvature * squares * values,
+        )
     return found_transforms(descent.values * per_step)
 
 

@@ -88,14 +88,12 @@ class Rigid(MotionPart):
             begin = predict_transforms(
                 replace(scene, displacement=memory), groups, able.astype(np.uint8), predicted=True
             )
-        passes = self.config.epochs * (FROM_REST if scene.displacement is None else 1)
-        found = self._fitted(work, begin, unit, passes=passes, rng=rng)
+        found = self._fitted(work, begin, unit, rest=scene.displacement is None, rng=rng)
         step = (config.step * unit).astype(np.float32).astype(np.float64)
         predicted = np.concatenate([start.translation, start.rotation], 1)
         symbols = np.rint((found - predicted) / step).astype(np.int32)
         kept = np.abs((predicted + symbols * step) / unit).max(1) >= config.least
-        moving = np.zeros(groups.count, np.uint8)
-        moving[np.flatnonzero(able)[kept]] = 1
+        moving = np.bincount(np.flatnonzero(able)[kept], minlength=groups.count).astype(np.uint8)
         return (
             Motion(
                 cell=groups.cell,
@@ -108,20 +106,21 @@ class Rigid(MotionPart):
         )
 
     def _fitted(
-        self, work: FitContext, start: GroupTransforms[FloatArray], unit: FloatArray, passes: int, rng: Rng
+        self, work: FitContext, start: GroupTransforms[FloatArray], unit: FloatArray, rest: bool, rng: Rng
     ) -> FloatArray:
         """[K, 6] shift and turn of the groups that explain the images best."""
         config, cameras = self.config, work.cameras
-        # The part of noise in a sum of so many values grows as the root of their number.
-        most = config.body_cost * (3 * cameras.height * cameras.width * len(cameras)) ** 0.5
         return fit_transforms_newton(
             work,
             start,
             unit,
-            iterations=work.scaled(passes * len(cameras)),
+            iterations=work.scaled(config.epochs * (FROM_REST if rest else 1) * len(cameras)),
             order=rng.numpy("motion", work.index),
             damping=Damping(DAMPING, config.hold, LONGEST * enlargement(cameras.width)),
-            settings=BodySettings(most, BODY_HOLD),
+            # The part of noise in a sum of so many values grows as the root of their number.
+            settings=BodySettings(
+                config.body_cost * (3 * cameras.height * cameras.width * len(cameras)) ** 0.5, BODY_HOLD
+            ),
         )
 
     def across_key(self, replaced: Scene, scene: Scene) -> Displacement | None:

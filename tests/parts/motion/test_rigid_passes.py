@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.picture_size import enlargement
+from gsstream.core.picture_size import enlargement, far_weight
 from gsstream.core.rng import Rng
+from gsstream.engine.step.context import EngineContext
 from gsstream.engine.step.motion import Moved, propose_motion
 from gsstream.engine.step.tools import RunTools
 from gsstream.input.recordings.open import open_source
@@ -20,9 +21,11 @@ from gsstream.method.budget import FrameBudget
 from gsstream.packet.changes.motion import encode_motions
 from gsstream.parts.backend.change import Change, find_change
 from gsstream.parts.motion.groups import pixel_size
+from gsstream.parts.motion.none import Still
 from gsstream.parts.motion.rigid import Rigid
+from gsstream.parts.render.target import ViewTarget
 from gsstream.parts.render.wrt import WrtRows
-from gsstream.testing.method_driver import SOURCE, FitFixture, fit_fixture, method_with
+from gsstream.testing.method_driver import SOURCE, FitFixture, MethodUnderTest, fit_fixture, method_with
 
 
 def near_by_hand(tiles: np.ndarray) -> np.ndarray:
@@ -97,22 +100,42 @@ def test_motions_look_near_the_change() -> None:
 
 
 @pytest.mark.parametrize("far", [1.0, 0.25, 0.0])
-def test_the_larger_the_picture_the_less_of_it_is_compared_with_a_residual(
-    far: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_less_far_tiles_weigh_the_less_of_them_is_compared(far: float) -> None:
     work = fit_fixture().work
-    monkeypatch.setattr("gsstream.engine.step.context.far_weight", lambda width: far)
     tiles = torch.zeros(len(work.cameras), 5, 7, dtype=torch.bool)
     tiles[:, 2, 3] = True
     work._change = Change(tiles, 5 * 16, 7 * 16)
-    weights = work.residual_target(0).tile_weights
+    weights = work.changed_target(0, far).tile_weights
     assert (weights is None) == (far == 1.0)
     if weights is not None:
         near = work._change.dilated[0]
         assert bool((weights[near] == 1).all())
         assert bool((weights[~near] == far).all())
         assert 0 < int(near.sum()) < near.numel()
-    assert work.everywhere().residual_target(0).tile_weights is None, "a residual of every row is compared everywhere"
+    everywhere = work.everywhere().changed_target(0, far)
+    assert everywhere.tile_weights is None, "a residual of every row is compared everywhere"
+
+
+@pytest.mark.parametrize("width", [320, 1352])
+def test_the_residual_of_a_large_picture_is_compared_with_less_of_what_is_far(
+    width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The width is only said to the rule: the pictures stay small."""
+    asked: list[float] = []
+    target = EngineContext.changed_target
+
+    def watched(self: EngineContext, view: int, far: float = 0.0) -> ViewTarget:
+        asked.append(far)
+        return target(self, view, far)
+
+    monkeypatch.setattr(EngineContext, "changed_target", watched)
+    monkeypatch.setattr("gsstream.engine.step.frame_step.far_weight", lambda _: far_weight(width))
+    method = MethodUnderTest("s2gs-edge")
+    method.assembly = replace(method.assembly, motion=Still())  # a motion is compared with what changed alone
+    source = open_source(SOURCE)
+    method.step(method.begin(source.frame(0)).state, source.frame(1))
+    assert set(asked) == {far_weight(width)}
+    assert far_weight(1352) < far_weight(320)
 
 
 #: Pictures this small hardly say where a group has gone: what holds it back must be weak.

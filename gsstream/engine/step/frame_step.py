@@ -69,7 +69,7 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
             logits=logits,
             decoders=state.decoders,
             session=work.session_for(rows),
-            # The larger the picture, the less weigh tiles away from every change (docs/results/extremes.md).
+            # The larger the picture, the less tiles away from every change weigh (docs/results/extremes.md).
             target=partial(
                 (work.everywhere() if scope is Scope.ALL else work).changed_target, far=far_weight(frame.cameras.width)
             ),

@@ -13,7 +13,8 @@ from gsstream.input.recordings.options import DataOptions
 from gsstream.recipe.budget import Budget
 
 SCHEMA_VERSION = "2.0"
-#: Sections of a recipe that do not influence frame 0. A section that is not listed counts as one that does.
+#: Sections of a recipe that do not influence frame 0, but for settings of the codec that :func:`first_frame_settings`
+#: names. A section that is not listed counts as one that does.
 LATER_KEYS = (
     "schema_version", "method", "seed", "frames", "confidence", "propagation", "gate", "regularizer", "update",
     "streaming_method", "stream", "codec", "motion", "growth",
@@ -221,3 +222,11 @@ class Recipe(Section):
     near: float = Field(
         default=0.01, gt=0, lt=1, description="near plane, fraction of the rig's extent; nothing closer is drawn"
     )
+
+
+def first_frame_settings(recipe: Recipe) -> dict[str, Any]:
+    """Return the settings that frame 0 depends on, besides the seed: two recipes that agree in them make the same."""
+    values = recipe.model_dump(mode="json", exclude=set(LATER_KEYS))
+    values["budget"] = {"memory": values["budget"]["memory"]}  # of a budget, frame 0 knows memory alone
+    values["codec"] = recipe.codec.model_dump(mode="json", include={"key_rd_lambda", "first_layer"})
+    return values

@@ -93,6 +93,10 @@ def test_frame_0_is_shared_exactly_where_it_does_not_vary(plan_of):
     for key, count in {
         "{stream.epochs: 3}": 2,
         "{stream.rd_lambda: 0.3}": 2,
+        "{codec.trim: 0.3}": 2,
+        "{codec.key_interval: 3}": 2,
+        "{codec.key_rd_lambda: 0}": 4,
+        "{codec.first_layer: 1}": 4,
         "{first_frame.lr_factor: 0.1}": 4,
         "{structure: other}": 4,
         "{first_frame.epochs: 3}": 4,

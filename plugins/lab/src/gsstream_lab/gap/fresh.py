@@ -19,7 +19,7 @@ from gsstream.engine.run.encoder import Callbacks, Encoder
 from gsstream.engine.run.output import write_whole
 from gsstream.input.recordings.base import Source, SourceInfo, check_index
 from gsstream.packet import EncodedPacket, StreamMeta, StreamWriter
-from gsstream.recipe.model import LATER_KEYS, Recipe
+from gsstream.recipe.model import Recipe, first_frame_settings
 
 #: Called with (frame, iterations done, iterations in all).
 Progress = Callable[[int, int, int], None]
@@ -63,9 +63,7 @@ class FreshFrames:
     def file(self, frame: int) -> Path:
         """Return where the reconstruction of a frame lies, or will."""
         recipe = self.assembly.recipe
-        values = recipe.model_dump(mode="json", exclude=set(LATER_KEYS))
-        values["budget"] = {"memory": values["budget"]["memory"]}  # of a budget, frame 0 knows memory alone
-        made_of = [self.source.info.uri, self.source.info.train.ids, recipe.seed, values]
+        made_of = [self.source.info.uri, self.source.info.train.ids, recipe.seed, first_frame_settings(recipe)]
         text = json.dumps(made_of, sort_keys=True, separators=(",", ":"))
         return self.cache / f"{hashlib.sha256(text.encode()).hexdigest()[:12]}-{frame:06d}.gss"
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from gsstream.recipe.document import Layer, Leaf, Origin
 from gsstream.recipe.load import FindMethod, ResolvedRecipe, recipe_hash, resolve_recipe
-from gsstream.recipe.model import LATER_KEYS
+from gsstream.recipe.model import first_frame_settings
 from gsstream.recipe.shipped import recipe_file
 from gsstream_lab.sweep.config import Axis, Range, Scene, SweepConfig, Variant, flat_settings
 from gsstream_lab.sweep.rows import with_bases
@@ -202,9 +202,7 @@ def _first_frame(
 ) -> FirstFrameRun:
     seed = seed if config.first_frame.seed is None else config.first_frame.seed
     recipe = resolved.recipe.model_copy(update={"seed": seed, "frames": 1})
-    values = recipe.model_dump(mode="json")
-    values["budget"] = {"memory": values["budget"]["memory"]}  # of a budget, frame 0 knows memory alone
-    key = _hash([scene.uri, seed, {k: v for k, v in values.items() if k not in LATER_KEYS}])
+    key = _hash([scene.uri, seed, first_frame_settings(recipe)])
     return FirstFrameRun(key, scene, variant.name, seed, ResolvedRecipe(recipe, resolved.origins))
 
 

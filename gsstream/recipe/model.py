@@ -13,11 +13,10 @@ from gsstream.input.recordings.options import DataOptions
 from gsstream.recipe.budget import Budget
 
 SCHEMA_VERSION = "2.0"
-#: Sections of a recipe that do not influence frame 0, but for settings of the codec that :func:`first_frame_settings`
-#: names. A section that is not listed counts as one that does.
+#: Sections of a recipe that do not influence frame 0. A section that is not listed counts as one that does.
 LATER_KEYS = (
     "schema_version", "method", "seed", "frames", "confidence", "propagation", "gate", "regularizer", "update",
-    "streaming_method", "stream", "codec", "motion", "growth",
+    "streaming_method", "stream", "motion", "growth",
 )  # fmt: skip
 
 
@@ -227,6 +226,6 @@ class Recipe(Section):
 def first_frame_settings(recipe: Recipe) -> dict[str, Any]:
     """Return the settings that frame 0 depends on, besides the seed: two recipes that agree in them make the same."""
     values = recipe.model_dump(mode="json", exclude=set(LATER_KEYS))
-    values["budget"] = {"memory": values["budget"]["memory"]}  # of a budget, frame 0 knows memory alone
-    values["codec"] = recipe.codec.model_dump(mode="json", include={"key_rd_lambda", "first_layer"})
+    for section, names in (("budget", ("memory",)), ("codec", ("key_rd_lambda", "first_layer"))):
+        values[section] = {name: values[section][name] for name in names}  # all that frame 0 knows of the section
     return values

@@ -39,8 +39,8 @@ from gsstream.parts.residual.optimiser import Iteration, ResidualEpoch
 from gsstream.parts.update.base import init_latents
 from gsstream.recipe.model import Stream
 
-#: Rows leave only when at least a tenth of them can: each time, every view has to be frozen anew.
-MAX_RETAINED_SHARE = 0.9
+#: Rows leave only when at least half of them can: each time, every view has to be frozen anew.
+MAX_RETAINED_SHARE = 0.5
 
 
 def optimise(assembly: Assembly, problem: Problem, schedule: EpochScheduler) -> Solution:

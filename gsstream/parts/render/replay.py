@@ -17,7 +17,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
-from functools import reduce
+from functools import partial, reduce
 from operator import and_
 from typing import Any, Protocol, TypeVar, cast, final
 
@@ -190,8 +190,8 @@ class Records:
         kept = [value.clone() for value in changed]
         try:
             self.recorder.is_busy = True
-            made = _Record(function, form, leaves)
-            made.record(self.recorder, is_new=kind not in self.recorder.done)
+            made = _Record(form, leaves)
+            made.record(self.recorder, function, is_new=kind not in self.recorder.done)
         except Exception as error:
             self.recorder.refused.add(name)
             said = f"{type(error).__name__}: {error}".splitlines()[0]
@@ -227,8 +227,8 @@ class Records:
 class _Record:
     """One function on tensors that stay, and what it returns."""
 
-    def __init__(self, function: Callable[[Any], Any], form: Any, leaves: list[torch.Tensor]) -> None:
-        self._function, self._slots = function, [value.detach().clone() for value in leaves]
+    def __init__(self, form: Any, leaves: list[torch.Tensor]) -> None:
+        self._slots = [value.detach().clone() for value in leaves]
         self._inputs = _put(form, iter(self._slots))
         self._loaded = [(value, value._version) for value in leaves]
         self._form: Any = None
@@ -236,14 +236,15 @@ class _Record:
         self._checks: list[Check] = []
         self.held = torch.ones((), dtype=torch.bool, device=leaves[0].device)
 
-    def record(self, recorder: Recorder, *, is_new: bool) -> None:
-        self._replay = recorder.record(self._work, is_new=is_new)
+    def record(self, recorder: Recorder, function: Callable[[Any], Any], *, is_new: bool) -> None:
+        # The function is not kept: what it was made from may be long gone when its record is still used.
+        self._replay = recorder.record(partial(self._work, function), is_new=is_new)
         self.held.fill_(True)  # of what was done once beforehand
 
-    def _work(self) -> None:
+    def _work(self, function: Callable[[Any], Any]) -> None:
         made: list[torch.Tensor] = []
         with collected_checks() as self._checks:
-            self._form = _take(self._function(self._inputs), made)
+            self._form = _take(function(self._inputs), made)
         self._made = [value.detach() for value in made]
         if self._checks:
             self._passed = torch.stack([ok for ok, _ in self._checks])

@@ -24,7 +24,9 @@ from gsstream.testing.pretend import DEVICE, PretendRecorder, kernel
 ON_DEVICE = Kernels(*(kernel(getattr(TORCH_KERNELS, field.name)) for field in fields(Kernels)))
 TILES_THERE = TileKernels(*(kernel(getattr(IN_TORCH, field.name)) for field in fields(TileKernels)))
 FUSED_THERE = Fused(
-    *(kernel(getattr(TORCH_FUSED, field.name)) for field in fields(Fused) if field.name != "tiles"), tiles=TILES_THERE
+    DEVICE.type,
+    *(kernel(getattr(TORCH_FUSED, field.name)) for field in fields(Fused) if field.name not in ("device", "tiles")),
+    tiles=TILES_THERE,
 )
 CPU = torch.device("cpu")
 #: The stand-in's formulas give other last bits on the two devices with an older torch.
@@ -51,7 +53,7 @@ class StandIn(Renderer):
 
     @property
     def loss(self) -> Loss:
-        return FusedLoss(self.fused)
+        return FusedLoss(self.fused, super().loss)
 
     @property
     def optimiser(self) -> RowOptimiser:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from gsstream_gsplat_render import loss
+from gsstream_gsplat_render import adam, boxes, loss, rate
 from gsstream_gsplat_render.fused import FusedAdam, FusedLoss, load_fused
 from torch_kernels import TORCH_FUSED
 
@@ -52,7 +53,8 @@ def test_the_loss_is_that_of_the_reference_in_every_tile_that_is_asked_for(
     size: tuple[int, int], as_bytes: bool
 ) -> None:
     image, target = pair(*size, as_bytes)
-    ours, reference = FusedLoss(FUSED), ReferenceLoss()
+    reference = ReferenceLoss()
+    ours = FusedLoss(FUSED, reference)
     for mask in masks(*size):
         for dssim in (0.0, 0.2, 1.0):
             value, gradient = ours.evaluate(image, ours.prepare(target), dssim, mask)
@@ -68,7 +70,7 @@ def test_the_loss_is_that_of_the_reference_in_every_tile_that_is_asked_for(
 
 def test_an_image_may_lie_in_any_order_and_what_is_not_asked_for_may_be_anything() -> None:
     image, target = pair(40, 44, as_bytes=False)
-    ours = FusedLoss(FUSED)
+    ours = FusedLoss(FUSED, ReferenceLoss())
     want, wanted = ours.evaluate(image, ours.prepare(target), 0.2)
     planes = image.permute(2, 0, 1).contiguous().permute(1, 2, 0)  # as a rasteriser by channels leaves it
     value, gradient = ours.evaluate(planes, ours.prepare(target), 0.2)
@@ -88,7 +90,9 @@ def test_a_value_that_is_not_finite_shows_in_the_loss() -> None:
     for wrong in (torch.nan, torch.inf, 1e30):
         image, target = pair(33, 17, as_bytes=True)
         image[20, 4, 1] = wrong
-        value, _ = FusedLoss(FUSED).evaluate(image, FusedLoss(FUSED).prepare(target), 0.2)
+        value, _ = FusedLoss(FUSED, ReferenceLoss()).evaluate(
+            image, FusedLoss(FUSED, ReferenceLoss()).prepare(target), 0.2
+        )
         assert not value.isfinite()
 
 
@@ -152,7 +156,7 @@ def test_where_triton_cannot_compile_the_reference_is_used_with_a_warning(monkey
 class Brings(ReferenceRenderer):  # type: ignore[misc]  # final; only its loss and its optimiser are others
     """The reference renderer with the kernels' loss and optimiser."""
 
-    loss = property(lambda _: FusedLoss(FUSED))  # type: ignore[assignment]
+    loss = property(lambda _: FusedLoss(FUSED, ReferenceLoss()))  # type: ignore[assignment]
     optimiser = property(lambda _: FusedAdam(FUSED, None))  # type: ignore[assignment]
 
 
@@ -172,6 +176,18 @@ CHECKS = [
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 def test_the_contract_of_a_loss_and_of_an_optimiser(check: Any) -> None:
     check(Brings())
+
+
+@pytest.mark.parametrize("module", [adam, boxes, rate], ids=lambda module: module.__name__.split(".")[-1])
+def test_no_kernel_is_compiled_anew_for_another_number_of_rows(module: Any) -> None:
+    """Triton compiles once more where a number becomes 1 or divisible by 16, unless it is told not to."""
+    by_rows = {"size", "count", "parts", "last", "halvings"}
+    kernels = [value for value in vars(module).values() if hasattr(value, "fn")]
+    found = {k.fn.__name__: by_rows.intersection(inspect.signature(k.fn).parameters) for k in kernels}
+    assert any(found.values())
+    for kernel in kernels:
+        spared = kernel.kwargs.get("do_not_specialize") if hasattr(kernel, "kwargs") else kernel.do_not_specialize
+        assert found[kernel.fn.__name__] <= set(spared or []), kernel.fn.__name__
 
 
 COMPILE = """

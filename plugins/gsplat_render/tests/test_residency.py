@@ -24,8 +24,11 @@ from gsstream.core.frame import Frame
 from gsstream.engine.frame0.optimise import FirstFrameRun
 from gsstream.engine.step import frame_step
 from gsstream.input.recordings.open import open_source
+from gsstream.parts.backend.adam import ReferenceAdam
 from gsstream.parts.motion.newton import DampedNewton
+from gsstream.parts.render.loss import ReferenceLoss
 from gsstream.parts.render.replay import Records
+from gsstream.parts.residual.adam_state import AdamState
 from gsstream.testing.method_driver import SOURCE
 from gsstream.testing.pretend import PretendDevice
 
@@ -198,13 +201,17 @@ def test_the_counts_of_a_narrowed_session_and_of_what_a_view_needs_first(monkeyp
 
         monkeypatch.setattr(GsplatSession, "own", counted_own)
         method.step(step.state, later)
-    assert drawn, "no row has left"
+    # The first call draws the pictures of all views, in which later ones only mark other tiles.
+    once, again = on_the_page("pictures of all views"), on_the_page("the same, of a view that is drawn for the first")
+    (pictures, *marked) = drawn
+    assert marked, "no row has left"
+    assert pictures <= once["operations"], drawn
     narrowed, motion = (
         on_the_page(f"one iteration of {what}, narrowed")["operations"] for what in ("a later frame", "motion")
     )
     assert max(size for name, size in sizes.items() if name.startswith("iterations")) <= narrowed, sizes
     assert max(size for name, size in sizes.items() if name.startswith("gradients by WrtTransforms")) <= motion, sizes
-    assert narrowed + max(drawn) <= on_the_page("the same, of a view that is drawn for the first time")["operations"]
+    assert narrowed + max(marked) <= again["operations"]
 
 
 @SAME_BITS
@@ -213,6 +220,26 @@ def test_other_methods_write_the_packets_of_the_processor(frames: list[Frame], n
     with PretendDevice():
         found = packets_of(frames[:2], DEVICE, name)
     assert found == packets_of(frames[:2], CPU, name)
+
+
+def test_what_lies_on_the_processor_is_computed_as_the_reference_does() -> None:
+    """A session returns what lies where its rows do, and kernels of a GPU cannot be given anything else."""
+    renderer, g = method_on(DEVICE).assembly.renderer, torch.Generator().manual_seed(0)
+    image, target = torch.rand(2, 20, 18, 3, generator=g).unbind()
+    reference, loss = ReferenceLoss(), renderer.loss
+    want, wanted = reference.evaluate(image, reference.prepare(target), 0.2)
+    value, gradient = loss.evaluate(image, loss.prepare(target), 0.2)
+    assert torch.equal(value, want)
+    assert torch.equal(gradient, wanted)
+    start, steps, gates = torch.rand(5, 3, generator=g), torch.ones(3), torch.ones(5)
+    moved = []
+    for optimiser in (renderer.optimiser, ReferenceAdam()):
+        table, by_table = start.clone(), start.clone() + 1
+        optimiser.add_rate(by_table, table, steps, gates, 0.1)
+        optimiser.step({"t": table}, {"t": by_table}, {"t": AdamState.start(table)}, {"t": 0.1})
+        moved.append(table)
+    assert torch.equal(*moved)
+    assert not torch.equal(moved[0], start)
 
 
 def with_intruder(monkeypatch: pytest.MonkeyPatch, intruder: Callable[[torch.Tensor], torch.Tensor]) -> None:

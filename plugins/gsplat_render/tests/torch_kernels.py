@@ -79,7 +79,7 @@ def tiles(
     packed: bool,
     n_images: int,
 ) -> tuple[torch.Tensor, ...]:
-    assert (packed, n_images) == (False, 1)
+    assert (packed, n_images) == (False, len(means2d))
     seen, nothing = (radii > 0).all(-1), torch.zeros(())
     means2d, depths = means2d.detach().where(seen[..., None], nothing), depths.detach().where(seen, nothing)
     number, keys, order = gsplat._isect_tiles(means2d, radii, depths, tile_size, columns, rows, sort=False)
@@ -109,6 +109,38 @@ def rasterize(
     packed: bool,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     assert not packed
+    splats, ends = (means2d, conics, colors, opacities), [*starts[1:, 0, 0].tolist(), len(order)]
+    views = [
+        _view(
+            *(value[view] for value in splats),
+            size=(width, height, tile_size),
+            starts=starts[view] - begin,
+            order=order[begin:end] - view * means2d.shape[1],
+            background=backgrounds[view],
+            mask=None if masks is None else masks[view],
+        )
+        for view, (begin, end) in enumerate(zip(starts[:, 0, 0].tolist(), ends, strict=True))
+    ]
+    # As of the kernel, gradients are zero and not missing where nothing is drawn.
+    nothing = sum(value[:, :0].sum() for value in splats)
+    image, alpha = (torch.stack(each) for each in zip(*views, strict=True))
+    return image + nothing, alpha[..., None] + nothing
+
+
+def _view(
+    means2d: torch.Tensor,
+    conics: torch.Tensor,
+    colors: torch.Tensor,
+    opacities: torch.Tensor,
+    *,
+    size: tuple[int, int, int],
+    starts: torch.Tensor,
+    order: torch.Tensor,
+    background: torch.Tensor,
+    mask: torch.Tensor | None,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """One picture [H, W, 3] and its alpha [H, W]."""
+    width, height, tile_size = size
     # There may be more rows of tiles than the picture has: they hold what is left of lists of fixed size.
     rows, columns = -(-height // tile_size), starts.shape[-1]
     bounds = [*starts.flatten().tolist(), len(order)]
@@ -118,20 +150,18 @@ def rasterize(
         for column in range(columns):
             place, tall = row * columns + column, min(tile_size, height - row * tile_size)
             wide = min(tile_size, width - column * tile_size)
-            if masks is not None and not bool(masks.flatten()[place]):
-                pictures.append(backgrounds[0].expand(tall, wide, 3))
+            if mask is not None and not bool(mask.flatten()[place]):
+                pictures.append(background.expand(tall, wide, len(background)))
                 opaque.append(torch.full((tall, wide), NAN))  # left as the memory was
                 continue
             ids = order[bounds[place] : bounds[place + 1]].long()
-            splats = means2d[0, ids], conics[0, ids], colors[0, ids], opacities[0, ids]
+            splats = means2d[ids], conics[ids], colors[ids], opacities[ids]
             light, after = _tile(*splats, (column * tile_size, row * tile_size), (tall, wide))
-            pictures.append(light + after[..., None] * backgrounds[0])
+            pictures.append(light + after[..., None] * background)
             opaque.append(1 - after)
         image.append(torch.cat(pictures, 1))
         alpha.append(torch.cat(opaque, 1))
-    # As of the kernel, gradients are zero and not missing where nothing is drawn.
-    nothing = sum(value[:, :0].sum() for value in (means2d, conics, colors, opacities))
-    return torch.cat(image)[None] + nothing, torch.cat(alpha)[None, ..., None] + nothing
+    return torch.cat(image), torch.cat(alpha)
 
 
 def _tile(
@@ -224,4 +254,4 @@ def add_rate(
     gradient.add_(laplace_gradient(latents, steps, spread, weight) * (gates > 0)[:, None])
 
 
-TORCH_FUSED = Fused(loss_by_tile, gradient_by_pixel, move_table, sum_symbols, add_rate, tiles=IN_TORCH)
+TORCH_FUSED = Fused("cpu", loss_by_tile, gradient_by_pixel, move_table, sum_symbols, add_rate, tiles=IN_TORCH)

@@ -15,7 +15,7 @@ from gsstream.backend import ADAM_BETAS
 BLOCK = 512
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["size", "last"])
 def _move(
     values,
     gradients,

@@ -15,7 +15,7 @@ from gsstream_gsplat_render.tiles import TILE, index_type
 BLOCK, WIDE = 256, 32
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def _find(means, radii, boxes, visible, count, rows, columns, side: tl.constexpr, block: tl.constexpr):
     """The box of ``block`` Gaussians, in tiles of ``side`` pixels."""
     row = tl.program_id(0) * block + tl.arange(0, block)
@@ -37,7 +37,7 @@ def _find(means, radii, boxes, visible, count, rows, columns, side: tl.constexpr
     tl.store(visible + row, is_drawn.to(tl.uint8), mask=there)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def _count(boxes, near, areas, count, block: tl.constexpr):
     """Tiles of the boxes of ``block`` Gaussians, in the order ``near``."""
     place = tl.program_id(0) * block + tl.arange(0, block)
@@ -48,7 +48,7 @@ def _count(boxes, near, areas, count, block: tl.constexpr):
     tl.store(areas + place, wide * high, mask=there)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "halvings", "size"])
 def _list(boxes, near, ends, most, places, owners, count, halvings, columns, spare, size, block: tl.constexpr):
     """Tile and row of ``block`` entries."""
     slot = tl.program_id(0) * block + tl.arange(0, block)

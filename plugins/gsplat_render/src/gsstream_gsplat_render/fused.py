@@ -22,14 +22,22 @@ from gsstream_gsplat_render.tiles import Grid, TileKernels, tile_lists
 
 @dataclass(frozen=True, slots=True)
 class Fused:
-    """Functions of one launch each, with the signatures of ``loss.py``, ``adam.py``, ``rate.py``, ``tiles.py``."""
+    """Functions of one launch each, with the signatures of ``loss.py``, ``adam.py``, ``rate.py``, ``tiles.py``.
 
+    ``device``: the type of the device that they run on. What lies elsewhere is computed as the reference does it.
+    """
+
+    device: str
     loss_by_tile: Callable[..., Any]
     gradient_by_pixel: Callable[..., Any]
     move_table: Callable[..., Any]
     sum_symbols: Callable[..., Any]
     add_rate: Callable[..., Any]
     tiles: TileKernels
+
+    def serves(self, tensor: torch.Tensor) -> bool:
+        """Say whether the kernels can be given this tensor."""
+        return tensor.device.type == self.device
 
 
 @functools.cache
@@ -65,7 +73,15 @@ def load_fused(device: str) -> Fused | None:
             stacklevel=2,
         )
         return None
-    return Fused(loss_by_tile, gradient_by_pixel, move_table, sum_symbols=sum_symbols, add_rate=add_rate, tiles=lists)
+    return Fused(
+        device=torch.device(device).type,
+        loss_by_tile=loss_by_tile,
+        gradient_by_pixel=gradient_by_pixel,
+        move_table=move_table,
+        sum_symbols=sum_symbols,
+        add_rate=add_rate,
+        tiles=lists,
+    )
 
 
 def _try_tiles(kernels: TileKernels, device: torch.device) -> None:
@@ -84,18 +100,23 @@ class FusedLoss(Loss):
 
     What it needs to know of a target takes less time to compute than to read, so a target waits as it came: three bytes
     a pixel.
+
+    Arguments:
+        reference: of what lies on another device.
     """
 
-    def __init__(self, fused: Fused) -> None:
-        self._fused = fused
+    def __init__(self, fused: Fused, reference: Loss) -> None:
+        self._fused, self._reference = fused, reference
 
     def prepare(self, target: torch.Tensor) -> Any:
-        return target.detach().contiguous()
+        return target.detach().contiguous() if self._fused.serves(target) else self._reference.prepare(target)
 
     def evaluate(
         self, image: torch.Tensor, prepared: Any, dssim: float, tile_mask: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         image = image.detach()
+        if not self._fused.serves(image):
+            return self._reference.evaluate(image, prepared, dssim, tile_mask)
         by_tile, by_window = self._fused.loss_by_tile(image, prepared, dssim, tile_mask)
         value = by_tile.sum(dtype=torch.float64) / image.numel()
         return value, self._fused.gradient_by_pixel(image, prepared, by_window, dssim, tile_mask)
@@ -121,6 +142,9 @@ class FusedAdam(ReplayedAdam):
         corrections: torch.Tensor,
         lr: float | torch.Tensor,
     ) -> None:
+        if not self._fused.serves(value):
+            super().move(value, gradient, state, corrections, lr=lr)
+            return
         moments = (state.exp_avg, state.exp_avg_sq, state.steps)
         self._fused.move_table(value, gradient, *moments, corrections, lr)
 
@@ -132,6 +156,8 @@ class FusedAdam(ReplayedAdam):
         gates: torch.Tensor,
         weight: float | torch.Tensor,
     ) -> None:
-        if latents.numel():
+        if not self._fused.serves(latents):
+            super().add_rate(gradient, latents, steps, gates=gates, weight=weight)
+        elif latents.numel():
             sums = self._fused.sum_symbols(latents, steps)
             self._fused.add_rate(gradient, latents, steps, gates, sums, weight)

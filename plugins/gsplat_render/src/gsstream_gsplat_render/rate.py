@@ -15,7 +15,7 @@ import triton.language as tl
 BLOCK, LEAST = 4096, 0.3
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def _sum(latents, scales, sums, count, width, rows: tl.constexpr, wide: tl.constexpr):
     """Sums of the magnitudes of ``rows`` x ``wide`` symbols by channel."""
     row, channel = tl.program_id(0) * rows + tl.arange(0, rows)[:, None], tl.arange(0, wide)[None, :]
@@ -28,7 +28,7 @@ def _sum(latents, scales, sums, count, width, rows: tl.constexpr, wide: tl.const
     tl.store(sums + tl.program_id(0) * width + places, tl.sum(symbol, 0), mask=places < width)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "parts"])
 def _price(
     gradients,
     latents,

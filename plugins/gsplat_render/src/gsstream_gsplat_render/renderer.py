@@ -45,7 +45,7 @@ class GsplatRenderer(Renderer):
     @property
     def loss(self) -> Loss:
         fused = load_fused(self.config.device)
-        return super().loss if fused is None else FusedLoss(fused)
+        return super().loss if fused is None else FusedLoss(fused, super().loss)
 
     @property
     def optimiser(self) -> RowOptimiser:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -21,9 +22,9 @@ KEPT = 8
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A camera and its background on the device.
+    """V cameras of one size, mostly one, and their background on the device.
 
-    ``viewmat`` [1, 4, 4], ``K`` [1, 3, 3], ``background`` [1, 3], ``centre`` [3] of the camera, all float32.
+    ``viewmat`` [V, 4, 4], ``K`` [V, 3, 3], ``background`` [V, 3], ``centre`` [V, 1, 3] of the cameras, all float32.
     """
 
     viewmat: torch.Tensor
@@ -77,12 +78,23 @@ class Rig:
                 viewmat=viewmat[None].to(self.device),
                 K=torch.as_tensor(cameras.Ks[view], dtype=torch.float32)[None].to(self.device),
                 background=torch.tensor([self.background], dtype=torch.float32).to(self.device),
-                centre=centre.to(self.device),
+                centre=centre[None, None].to(self.device),
                 width=cameras.width,
                 height=cameras.height,
                 near=cameras.near_plane,
             )
         return self._targets[view]
+
+    def together(self, views: Sequence[int]) -> Target:
+        """Return these cameras as one target, whose views are drawn in one call."""
+        targets = [self[view] for view in views]
+        return replace(
+            targets[0],
+            viewmat=torch.cat([each.viewmat for each in targets]),
+            K=torch.cat([each.K for each in targets]),
+            background=torch.cat([each.background for each in targets]),
+            centre=torch.cat([each.centre for each in targets]),
+        )
 
     def numbers(self, view: int) -> torch.Tensor:
         """Return [14] float64: rotation of a camera row by row, offset, focal lengths."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from copy import copy
 from typing import NamedTuple, final
@@ -9,12 +10,22 @@ from typing import NamedTuple, final
 import torch
 
 from gsstream.api import Cameras, Gaussians, ShapeError
-from gsstream.backend import RenderOutput, RenderSession, ScreenGradient, drawn_rows
+from gsstream.backend import RenderOutput, RenderSession, ScreenGradient, check_tiles
 from gsstream.replay import RecordError, Records, ReplayedSession, SeenView
 from gsstream_gsplat_render.kernels import Kernels
 from gsstream_gsplat_render.rig import Background, Rig, Rigs, Target
 from gsstream_gsplat_render.seen import Projected
-from gsstream_gsplat_render.splat import Drawn, Pasted, composite, composite_fixed, draw, pixels, project
+from gsstream_gsplat_render.splat import (
+    Drawn,
+    Pasted,
+    composite,
+    composite_fixed,
+    draw,
+    draw_views,
+    pixels,
+    project,
+    rows_in_tiles,
+)
 from gsstream_gsplat_render.tiles import Grid
 
 
@@ -38,14 +49,20 @@ class Own(NamedTuple):
 
 
 class _Scatter(NamedTuple):
-    """A view, and the gradient by its image [H, W, 3]. ``grid``: None: lists are as long as they have to be."""
+    """A scene, a view, and the gradient by its image [H, W, 3].
 
+    ``grid``: None: lists are as long as they have to be.
+    """
+
+    scene: Gaussians[torch.Tensor]
     target: Target
     upstream: torch.Tensor
     grid: Grid | None
 
 
 SCATTERED = "gradients on the screen"
+#: Pixels, and Gaussians times views, of one call that draws several views.
+PIXELS, ROWS = 1 << 24, 1 << 23
 
 
 @final
@@ -72,11 +89,11 @@ class GsplatSession(ReplayedSession):
         self._home = gaussians.means.device
         self._scene = _moved(gaussians.map(torch.Tensor.detach), rigs.device)
         self._active: torch.Tensor | None = None
-        self._pictures: dict[int, Drawn] = {}
+        #: Of each view the image, its alpha, and the boxes of the Gaussians.
+        self._pictures: dict[int, tuple[torch.Tensor, ...]] = {}
         self._tiles: dict[int, torch.Tensor] = {}
-        #: Of what the active rows make, and of gradients on the screen, which belong to the scene.
+        #: Of what the active rows make.
         self._records: Records | None = None
-        self._scattered: Records | None = None
         if active is not None:
             self.narrow(active)
 
@@ -115,14 +132,31 @@ class GsplatSession(ReplayedSession):
         return RenderOutput(image.to(home), alpha.to(home), tiles[:-1].to(home))
 
     def visible(self, view: int, tiles: torch.Tensor) -> torch.Tensor:
-        target, grid = self._rig[view], self._rig.grid
-        size = self._cameras.height, self._cameras.width
+        check_tiles(tiles, (self._cameras.height, self._cameras.width))
+        return self._drawn_in([view], tiles[None])
 
-        def shown(scene: Gaussians[torch.Tensor]) -> RenderOutput:
-            drawn = draw(self._kernels, scene, target, grid)
-            return RenderOutput(drawn.image, drawn.alpha)
+    def visible_anywhere(self, tiles: torch.Tensor) -> torch.Tensor:
+        for each in tiles:
+            check_tiles(each, (self._cameras.height, self._cameras.width))
+        # A camera without a marked tile has no say, and need not be projected into.
+        views = tiles.flatten(1).any(1).cpu().nonzero()[:, 0].tolist()
+        return self._drawn_in(views, tiles if len(views) == len(tiles) else tiles[views])
 
-        return drawn_rows(shown, self._scene, size, tiles.to(self._rigs.device)).to(self._home)
+    def _drawn_in(self, views: Sequence[int], tiles: torch.Tensor) -> torch.Tensor:
+        """[N] bool: drawn in the marked tiles [V, rows, columns] of any of these views."""
+        there = tiles.to(self._rigs.device)
+        drawn = torch.zeros_like(self._scene.opacities, dtype=torch.bool)
+        if len(self._scene):
+            for some in self._at_once(len(views)):
+                together = self._rig.together(views[some])
+                drawn = drawn | rows_in_tiles(self._kernels, self._scene, together, there[some])
+        return drawn.to(self._home)
+
+    def _at_once(self, count: int) -> list[slice]:
+        """So many views are drawn in one call that memory is bounded."""
+        size = self._cameras.height * self._cameras.width
+        step = max(1, min(PIXELS // size, ROWS // max(1, len(self._scene))))
+        return [slice(at, at + step) for at in range(0, count, step)]
 
     def narrow(self, active: torch.Tensor) -> None:
         self._active = active.to(self._rigs.device)
@@ -146,21 +180,21 @@ class GsplatSession(ReplayedSession):
             none = self._scene.means[:, :2].to(self._home)
             return ScreenGradient(none, none[:, 0] > 0)
         upstream = image_gradient.to(place).float()
-        if self._scattered is None and rig.recorder is not None and self._home == place:
-            self._scattered = Records(rig.recorder, room=rig)
-        found = None
-        if self._scattered is not None and rig.is_measured and self._scattered.can(SCATTERED):
+        records, found = rig.records if self._home == place else None, None
+        if records is not None and rig.is_measured and records.can(SCATTERED):
             with suppress(RecordError):
-                found = self._scattered.call(SCATTERED, self._scatter, _Scatter(rig[view], upstream, rig.grid))
+                asked = _Scatter(self._scene, rig[view], upstream, rig.grid)
+                found = records.call(SCATTERED, self._scatter, asked)
         if found is None:
-            found = self._scatter(_Scatter(rig[view], upstream, None))
+            found = self._scatter(_Scatter(self._scene, rig[view], upstream, None))
         return ScreenGradient(found.gradient.to(self._home), found.visible.to(self._home))
 
     def _scatter(self, asked: _Scatter) -> ScreenGradient:
-        (target, upstream, grid), rig = asked, self._rigs.find(self._cameras, (0.0, 0.0, 0.0))
-        probe = torch.zeros_like(self._scene.means[:, :2]).requires_grad_()
+        """Of the scene that is handed over, and nothing else of this session: its record serves others."""
+        (scene, target, upstream, grid), rig = asked, self._rigs.find(self._cameras, (0.0, 0.0, 0.0))
+        probe = torch.zeros_like(scene.means[:, :2]).requires_grad_()
         with torch.enable_grad():
-            seen = project(self._kernels, self._scene, target, grid or rig.grid, probe=probe)
+            seen = project(self._kernels, scene, target, grid or rig.grid, probe=probe)
             if grid is None:
                 drawn = composite(self._kernels, seen, target)
                 rig.count(drawn.entries)
@@ -223,15 +257,17 @@ class GsplatSession(ReplayedSession):
     def _shown_before(self, view: int) -> Shown:
         """The view of the session's scene, and the tiles in which the active rows are drawn in it."""
         assert self._active is not None
+        if view not in self._pictures:
+            # A pass asks for every view.
+            some = next(each for each in self._at_once(len(self._cameras)) if each.start <= view < each.stop)
+            views = range(len(self._cameras))[some]
+            found = draw_views(self._kernels, self._scene, self._rig.together(views), self._rig.grid)
+            self._rig.count(found.entries)
+            self._pictures.update(zip(views, zip(found.image, found.alpha, found.boxes, strict=True), strict=True))
+        image, alpha, boxes = self._pictures[view]
         if view not in self._tiles:
-            target, grid = self._rig[view], self._rig.grid
-            with torch.no_grad():
-                seen = project(self._kernels, self._scene, target, grid)
-                if view not in self._pictures:
-                    self._pictures[view] = self._composited(seen, target)
-                self._tiles[view] = grid.covered(seen.boxes, self._active)
-        drawn = self._pictures[view]
-        return Shown(drawn.image, drawn.alpha, self._tiles[view])
+            self._tiles[view] = self._rig.grid.covered(boxes, self._active)
+        return Shown(image, alpha, self._tiles[view])
 
 
 def _moved(gaussians: Gaussians[torch.Tensor], device: torch.device) -> Gaussians[torch.Tensor]:

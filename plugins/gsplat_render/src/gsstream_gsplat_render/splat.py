@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import torch
 
@@ -34,23 +35,7 @@ def project(
 ) -> Projected:
     """Project raw Gaussians [N], N > 0, that are on the device already; ``probe`` [N, 2] is added to the 2-D means."""
     opacities = gaussians.opacities.sigmoid()
-    radii, means2d, depths, conics, _ = kernels.project(
-        gaussians.means,
-        None,
-        gaussians.quats,
-        gaussians.scales.exp(),
-        view.viewmat,
-        view.K,
-        view.width,
-        view.height,
-        eps2d=BLUR,
-        near_plane=view.near,
-        far_plane=FAR,
-        radius_clip=0.0,
-        packed=False,
-        calc_compensations=False,
-        opacities=opacities,
-    )
+    radii, means2d, depths, conics = _projected(kernels, gaussians, view, opacities)
     if probe is not None:
         means2d = means2d + probe[None]
     boxes, visible = grid.boxes(means2d.squeeze(0), radii.squeeze(0))
@@ -68,17 +53,38 @@ def project(
     )
 
 
+def _projected(
+    kernels: Kernels, gaussians: Gaussians[torch.Tensor], view: Target, opacities: torch.Tensor
+) -> tuple[torch.Tensor, ...]:
+    """Radii [V, N, 2] int32, 2-D means [V, N, 2], depths [V, N] and conics [V, N, 3] of the V views of a target."""
+    found: tuple[torch.Tensor, ...] = kernels.project(
+        gaussians.means,
+        None,
+        gaussians.quats,
+        gaussians.scales.exp(),
+        view.viewmat,
+        view.K,
+        view.width,
+        view.height,
+        eps2d=BLUR,
+        near_plane=view.near,
+        far_plane=FAR,
+        radius_clip=0.0,
+        packed=False,
+        calc_compensations=False,
+        opacities=opacities,
+    )
+    return found[:4]
+
+
 def composite(kernels: Kernels, seen: Projected, view: Target, mask: torch.Tensor | None = None) -> Drawn:
     """Composite what was projected; with a mask [tile rows + 1, tile columns] in its tiles, else show the background.
 
     The last row of the mask is not looked at.
     """
-    rows, columns = view.tiles
-    means2d, radii, depths = seen.means2d[None], seen.radii[None], seen.depths[None]
-    _, keys, order = kernels.tiles(means2d, radii, depths, TILE, columns, rows, packed=False, n_images=1)
-    offsets = kernels.offsets(keys, 1, columns, rows).reshape(rows, columns)
-    wanted = None if mask is None else mask[:rows]
-    image, alpha = _rasterized(kernels, seen, view, offsets=offsets, order=order, mask=wanted)
+    order, offsets = _sorted(kernels, seen.means2d[None], seen.radii[None], depths=seen.depths[None], views=view)
+    wanted = None if mask is None else mask[: len(offsets[0])]
+    image, alpha = _rasterized(kernels, seen, view, offsets=offsets.squeeze(0), order=order, mask=wanted)
     return Drawn(image, alpha, entries=len(order))
 
 
@@ -120,6 +126,89 @@ def _rasterized(
     return image.squeeze(0), alpha.squeeze((0, 3))
 
 
+class Pictures(NamedTuple):
+    """V views: image [V, H, W, 3], alpha [V, H, W], and the boxes [V, N, 4] int32 of their Gaussians, in tiles.
+
+    ``entries``: of the longest lists of tiles that one of the views needs.
+    """
+
+    image: torch.Tensor
+    alpha: torch.Tensor
+    boxes: torch.Tensor
+    entries: int
+
+
+def draw_views(kernels: Kernels, gaussians: Gaussians[torch.Tensor], views: Target, grid: Grid) -> Pictures:
+    """Draw raw Gaussians [N], N > 0, into all views of a target in one call; nothing is differentiated."""
+    with torch.no_grad():
+        opacities = gaussians.opacities.sigmoid()
+        radii, means2d, depths, conics = _projected(kernels, gaussians, views, opacities)
+        boxes, visible = grid.boxes(means2d.flatten(0, 1), radii.flatten(0, 1))
+        colors = _colors(kernels, gaussians, views, visible.view(radii.shape[:2]))
+        order, offsets = _sorted(kernels, means2d, radii, depths=depths, views=views)
+        image, alpha = kernels.rasterize(
+            means2d,
+            conics,
+            colors,
+            opacities.expand(len(colors), -1),
+            views.width,
+            views.height,
+            TILE,
+            offsets,
+            order,
+            backgrounds=views.background,
+            masks=None,
+            packed=False,
+        )
+        begins = [*offsets[:, 0, 0].cpu().tolist(), len(order)]
+    longest = max(end - begin for begin, end in pairwise(begins))
+    return Pictures(image, alpha.squeeze(-1), boxes.view(*radii.shape[:2], 4), longest)
+
+
+def rows_in_tiles(
+    kernels: Kernels, gaussians: Gaussians[torch.Tensor], views: Target, tiles: torch.Tensor
+) -> torch.Tensor:
+    """Return [N] bool: which of the raw Gaussians, N > 0, are drawn in the marked tiles of any view.
+
+    The derivative of a picture by the brightness of a Gaussian is the sum of its weights alpha * transmittance, which
+    are positive where it is drawn and zero elsewhere, so nothing can cancel.
+
+    Arguments:
+        tiles: [V, tile rows, tile columns] bool. Others are not drawn.
+    """
+    with torch.no_grad():
+        opacities = gaussians.opacities.sigmoid()
+        radii, means2d, depths, conics = _projected(kernels, gaussians, views, opacities)
+        order, offsets = _sorted(kernels, means2d, radii, depths=depths, views=views)
+    brightness = means2d.new_ones(*radii.shape[:2], 1).requires_grad_()
+    with torch.enable_grad():
+        image, _ = kernels.rasterize(
+            means2d,
+            conics,
+            brightness,
+            opacities.expand(len(means2d), -1),
+            views.width,
+            views.height,
+            TILE,
+            offsets,
+            order,
+            backgrounds=torch.zeros_like(views.background[:, :1]),
+            masks=tiles,
+            packed=False,
+        )
+        (weights,) = torch.autograd.grad(image, brightness, torch.ones_like(image))
+    return (weights > 0).flatten(2).any(2).any(0)
+
+
+def _sorted(
+    kernels: Kernels, means2d: torch.Tensor, radii: torch.Tensor, depths: torch.Tensor, views: Target
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Entries of the tiles of V views, and [V, rows, columns] where those of each tile begin."""
+    (rows, columns), count = views.tiles, len(means2d)
+    _, keys, order = kernels.tiles(means2d, radii, depths, TILE, columns, rows, packed=False, n_images=count)
+    return order, kernels.offsets(keys, count, columns, rows).reshape(count, rows, columns)
+
+
 def draw(kernels: Kernels, gaussians: Gaussians[torch.Tensor], view: Target, grid: Grid) -> Drawn:
     """Draw raw Gaussians [N] that are on the device already."""
     if len(gaussians) == 0:
@@ -150,10 +239,12 @@ class Pasted(torch.autograd.Function):
 
 
 def _colors(kernels: Kernels, gaussians: Gaussians[torch.Tensor], view: Target, visible: torch.Tensor) -> torch.Tensor:
-    """[1, N, 3] colours max(0, 0.5 + harmonics), seen from the camera."""
+    """[V, N, 3] colours max(0, 0.5 + harmonics), seen from the cameras."""
     coefficients = torch.cat([gaussians.sh0, gaussians.shN], 1)
-    directions = gaussians.means - view.centre
-    harmonics = kernels.harmonics(gaussians.sh_degree, directions[None], coefficients[None], masks=visible)
+    directions = gaussians.means[None] - view.centre
+    # Of one view the gradient of an index is a view, that of an expansion a sum.
+    every = coefficients[None] if len(directions) == 1 else coefficients.expand(len(directions), -1, -1, -1)
+    harmonics = kernels.harmonics(gaussians.sh_degree, directions, every, masks=visible)
     # clamp_min(0), whose gradient takes three operations: no sum with 0.5 lies between this bound and 0.
     return torch.nn.functional.threshold(harmonics + 0.5, -torch.finfo(torch.float32).tiny, 0.0)
 

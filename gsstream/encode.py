@@ -176,7 +176,7 @@ def encoder_for(
     assembly = _assembled(method, settings, parts)
 
     def seeds(frame: Frame) -> Any:
-        return gather_points(source, frame, assembly.recipe.first_frame)
+        return gather_points(source, frame, assembly.recipe.first_frame, device=assembly.renderer.device)
 
     return Encoder(assembly, source.info, seeds, callbacks=listeners)
 

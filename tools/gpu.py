@@ -105,7 +105,7 @@ def measured(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     settings: dict[str, Any] = dict(text.split("=", 1) for text in options.settings)
     yield machine()
     with open_recording(options.source, recipe_for(options.method, settings)) as source:
-        frames = [source.frame(index) for index in range(min(options.frames, source.info.num_frames))]
+        frames = [source.stored_frame(index) for index in range(min(options.frames, source.info.num_frames))]
         for queued in (False, True) if options.queued else (False,):
             counted = Counted()
             encoder = encoder_for(options.method, source, settings=settings)

@@ -223,7 +223,7 @@ class Encoder:
         return mean_color(frame.as_float32().images) if wanted == "auto" else wanted
 
     def _swept(self, frame: Frame) -> PointCloud:
-        return gather_points(None, frame, self.assembly.recipe.first_frame)
+        return gather_points(None, frame, self.assembly.recipe.first_frame, device=self.assembly.renderer.device)
 
     def _meta(self, frame: Frame) -> StreamMeta:
         info, recipe = self.info, self.assembly.recipe

@@ -173,9 +173,9 @@ class _Run:
         self.written = time.time()
 
     def _seeds(self, frame: Frame) -> PointCloud:
-        recipe = self.encoder.assembly.recipe
+        recipe, device = self.encoder.assembly.recipe, self.encoder.assembly.renderer.device
         seen = with_test_views(self.source, frame) if recipe.data.leak == "points" else frame
-        points = gather_points(self.source, seen, recipe.first_frame, self.progress.tell)
+        points = gather_points(self.source, seen, recipe.first_frame, self.progress.tell, device=device)
         self.seeded = points.origin
         return points
 

@@ -37,7 +37,8 @@ class SweepSettings:
         noise: image noise in [0, 1] below which texture does not count.
         unseen: cost of a hypothesis outside a neighbour's image; an uncorrelated match costs 0.5.
         step_penalty, jump_penalty: aggregation costs of a change by one plane and by more.
-        workers: threads, each on a view of its own; 0: one for each processor that the process may use.
+        workers: threads, each on a view of its own; 0: as many as ``one_thread_each`` makes.
+        device: where the costs of matching are computed, as torch names it.
     """
 
     planes: int = 128
@@ -48,6 +49,7 @@ class SweepSettings:
     step_penalty: float = 0.03
     jump_penalty: float = 1.0
     workers: int = 0
+    device: str = "cpu"
 
 
 def sweep_depths(images: FloatArray, cameras: Cameras, settings: SweepSettings, tell: Tell = silent) -> FloatArray:
@@ -56,7 +58,7 @@ def sweep_depths(images: FloatArray, cameras: Cameras, settings: SweepSettings, 
     Returns [C, H, W] float32, scene units. Deterministic for any number of workers.
     """
     check_shape("images", images, (len(cameras), cameras.height, cameras.width, 3))
-    grey = torch.from_numpy(np.ascontiguousarray(images @ _GREY))
+    grey = torch.from_numpy(np.ascontiguousarray(images @ _GREY)).to(settings.device)
     partners = neighbour_views(cameras, settings.neighbours)
     near_far = depth_range(cameras)
     # Steps uniform in the root of inverse depth: finer for far walls than uniform parallax, coarser right at the lens.
@@ -68,7 +70,7 @@ def sweep_depths(images: FloatArray, cameras: Cameras, settings: SweepSettings, 
         cost = _matching_cost(
             grey, cameras, view, partners=partners[view].tolist(), inverse=inverse[view], settings=settings, stop=stop
         )
-        total = aggregate(cost, grey[view].numpy(), settings.step_penalty, settings.jump_penalty)
+        total = aggregate(cost, grey[view].cpu().numpy(), settings.step_penalty, settings.jump_penalty)
         plane = best_plane(total)
         depth: FloatArray = (root[view, 0] + plane * (root[view, 1] - root[view, 0])) ** -2.0
         return depth.astype(np.float32)
@@ -97,7 +99,7 @@ def agreements(
     Returns [V]: share, 0 to 1, of the textured pixels of each of these views; NaN where one has no texture.
     """
     check_shape("images", images, (len(cameras), cameras.height, cameras.width, 3))
-    grey = torch.from_numpy(np.ascontiguousarray(images @ _GREY))
+    grey = torch.from_numpy(np.ascontiguousarray(images @ _GREY)).to(settings.device)
     partners = neighbour_views(cameras, settings.neighbours)
     near_far = depth_range(cameras)
 
@@ -107,7 +109,7 @@ def agreements(
         cost = _matching_cost(
             grey, cameras, view, partners=partners[view].tolist(), inverse=inverse, settings=settings
         ).min(0)
-        variance = _mean_and_variance(grey[view][None, None], settings.windows[0])[1][0, 0].numpy()
+        variance = _mean_and_variance(grey[view][None, None], settings.windows[0])[1][0, 0].cpu().numpy()
         textured = variance > (3 * settings.noise) ** 2
         return float((cost[textured] < limit).mean()) if textured.any() else np.nan
 
@@ -128,14 +130,15 @@ def _matching_cost(
     height, width = grey.shape[1:]
     reference = grey[view][None, None]
     statistics = [_mean_and_variance(reference, half) for half in settings.windows]
-    maps = [_plane_map(cameras, view, partner) for partner in partners]
+    maps = [_plane_map(cameras, view, partner, grey.device) for partner in partners]
     cost = np.zeros((len(inverse), height, width), np.float32)
-    chunk = 4  # planes at a time: the temporaries stay in the cache
+    # Planes at a time: what is made in between stays in a processor's cache; a GPU is asked once.
+    chunk = 4 if grey.device.type == "cpu" else len(inverse)
     for start in range(0, len(inverse), chunk):
         if stop is not None and stop.is_set():
             break
-        planes = torch.from_numpy(inverse[start : start + chunk])
-        best = torch.full((len(planes), height, width), settings.unseen)
+        planes = torch.from_numpy(inverse[start : start + chunk]).to(grey.device)
+        best = planes.new_full((len(planes), height, width), settings.unseen)
         second = best.clone()
         for partner, (rotation, translation) in zip(partners, maps, strict=True):
             grid, unseen = _grid(rotation, translation, planes, height=height, width=width)
@@ -146,11 +149,13 @@ def _matching_cost(
             match.masked_fill_(unseen, settings.unseen)
             second = torch.minimum(second, torch.maximum(best, match))
             best = torch.minimum(best, match)
-        cost[start : start + chunk] = (0.5 * (best + second)).numpy()
+        cost[start : start + chunk] = (0.5 * (best + second)).cpu().numpy()
     return cost
 
 
-def _plane_map(cameras: Cameras, view: int, partner: int) -> tuple[torch.Tensor, torch.Tensor]:
+def _plane_map(
+    cameras: Cameras, view: int, partner: int, device: torch.device
+) -> tuple[torch.Tensor, torch.Tensor]:
     """A pixel at inverse depth q lands in the partner at (A + q b), homogeneous, image = [-1, 1]; A [3, HW], b [3]."""
     relative = cameras.viewmats[partner] @ np.linalg.inv(cameras.viewmats[view])
     to_unit = np.array([[2 / cameras.width, 0, -1], [0, 2 / cameras.height, -1], [0, 0, 1.0]])
@@ -158,7 +163,8 @@ def _plane_map(cameras: Cameras, view: int, partner: int) -> tuple[torch.Tensor,
     uv = pixel_centers(cameras.width, cameras.height)
     rays = np.linalg.inv(cameras.Ks[view]) @ np.concatenate([uv, np.ones((len(uv), 1))], axis=1).T
     rotation = (camera @ relative[:3, :3] @ rays).astype(np.float32)
-    return torch.from_numpy(rotation), torch.from_numpy((camera @ relative[:3, 3]).astype(np.float32))
+    offset = (camera @ relative[:3, 3]).astype(np.float32)
+    return torch.from_numpy(rotation).to(device), torch.from_numpy(offset).to(device)
 
 
 def _grid(

@@ -1,4 +1,4 @@
-"""Threads for many small tensors, on all processors."""
+"""Threads for many small tensors, on several processors."""
 
 from __future__ import annotations
 
@@ -11,15 +11,19 @@ import torch
 from gsstream.core.processors import processors
 
 
+#: More threads than this wait for each other between their small operations: sixteen of them take three times as long.
+MOST = 4
+
+
 @contextmanager
 def one_thread_each(workers: int = 0) -> Iterator[ThreadPoolExecutor]:
     """Give a pool of threads, and let torch run on one thread inside and outside of it: a second thread within a small
-    operation costs more time than it saves. 0 workers: one for each processor.
+    operation costs more time than it saves. 0 workers: one for each processor, at most MOST.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with ThreadPoolExecutor(workers or processors(), initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        with ThreadPoolExecutor(workers or min(processors(), MOST), initializer=torch.set_num_threads, initargs=(1,)) as pool:
             yield pool
     finally:
         torch.set_num_threads(threads)

@@ -21,8 +21,9 @@ from gsstream.input.seeds.aggregate import aggregate, best_plane
 from gsstream.input.seeds.fusion import agreement, color_gains, interpolate_depths
 from gsstream.input.seeds.geometry import depth_range, neighbour_views, visible_views
 from gsstream.input.seeds.seeding import photo_consistent_seeds
-from gsstream.input.seeds.sweep import SweepSettings
+from gsstream.input.seeds.sweep import SweepSettings, sweep_depths
 from gsstream.input.seeds.thinning import thin_points
+from gsstream.testing.pretend import AVAILABLE, NAME
 
 QUICK = SweepSettings(planes=64, neighbours=4)
 
@@ -105,6 +106,14 @@ def test_dense_seeds_lie_on_the_true_surfaces(scene: SyntheticSource) -> None:
         column, row = (uv[inside] // 6).astype(int).T
         assert len(set(zip(column, row, strict=True))) > (0.85 if 2 <= view <= 7 else 0.7) * 16 * 12
     np.testing.assert_allclose(seeds.gains, 1, atol=0.03)
+
+
+@pytest.mark.skipif(not AVAILABLE, reason="needs a process in which torch sees no GPU")
+def test_depths_are_those_of_the_processor_on_a_device_that_takes_no_tensor_of_another(scene: SyntheticSource) -> None:
+    images, cameras = scene.frame(0).images[:4], scene.info.train.select([0, 1, 2, 3])
+    few = dataclasses.replace(QUICK, planes=16)
+    there = sweep_depths(images, cameras, dataclasses.replace(few, device=NAME))
+    np.testing.assert_allclose(there, sweep_depths(images, cameras, few), rtol=1e-5)
 
 
 @pytest.mark.usefixtures("without_room")

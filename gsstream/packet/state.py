@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from gsstream.core.changes import Delta, Layout, Scene, apply_delta
+from gsstream.core.changes import Delta, Displacement, Layout, Scene, apply_delta
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
@@ -13,6 +13,9 @@ from gsstream.packet.base import PacketKind, parse_header
 from gsstream.packet.delta import decode_delta, decode_empty, next_decoders
 from gsstream.packet.key import decode_key
 from gsstream.packet.meta import StreamMeta
+
+#: Empty packets after which what moved before is taken to have stopped.
+MOST_SKIPPED = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +32,7 @@ class PlayerState:
         key_rows: number of Gaussians of the last key packet.
         replaced: the scene of the frame before, which the key packet of this frame replaced; None where this frame has
             another packet, or the player began with it.
+        empty: number of empty packets up to this frame.
     """
 
     frame: int
@@ -39,6 +43,7 @@ class PlayerState:
     before: Layout | None = None
     key_rows: int = 0
     replaced: Scene | None = None
+    empty: int = 0
 
     @property
     def gaussians(self) -> Gaussians[FloatArray]:
@@ -70,13 +75,16 @@ def decode_packet(state: PlayerState | None, data: bytes, *, offset: int = 0) ->
         raise PacketError(f"frame {header.frame} needs the state of the frame before it, got {had}", offset)
     if header.kind == PacketKind.EMPTY:
         decode_empty(data, offset=offset)
-        still = replace(state.scene, displacement=None)
-        return replace(state, frame=header.frame, scene=still, delta=None, before=None, replaced=None)
+        still = replace(state.scene, displacement=None, heading=_heading_on(state))
+        number = state.empty + 1
+        return replace(state, frame=header.frame, scene=still, delta=None, before=None, replaced=None, empty=number)
     delta = decode_delta(data, state.scene, state.decoders, offset=offset)
     try:
         scene = apply_delta(state.scene, delta)
     except ShapeError as error:
         raise PacketError(str(error), offset) from error
+    if state.empty and scene.displacement is not None:  # the way of several frames
+        scene = replace(scene, heading=scene.displacement.times(1 / (state.empty + 1)))
     decoders = next_decoders(state.decoders, delta)
     return PlayerState(
         frame=header.frame,
@@ -87,3 +95,15 @@ def decode_packet(state: PlayerState | None, data: bytes, *, offset: int = 0) ->
         before=state.layout,
         key_rows=state.key_rows,
     )
+
+
+def _heading_on(state: PlayerState) -> Displacement | None:
+    """How far rows will have gone by the frame after an empty packet that follows this state.
+
+    The packet says that nothing changed or that its frame was skipped: what moved has stopped, or is ever farther from
+    where the scene has it.
+    """
+    moved = state.scene.heading or state.scene.displacement
+    if moved is None or state.empty >= MOST_SKIPPED:
+        return None
+    return moved.times((state.empty + 2) / (state.empty + 1))

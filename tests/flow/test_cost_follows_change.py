@@ -13,6 +13,7 @@ from gsstream_cpu_render.session import CpuSession
 
 from gsstream.core.context import ScreenGradient
 from gsstream.engine.step import frame_step as step_module
+from gsstream.engine.step import optimise as optimise_module
 from gsstream.packet import StreamReader
 from gsstream.parts.backend.base import ScatterSession
 
@@ -87,6 +88,7 @@ def test_rows_behind_closed_gates_leave_and_stay_as_they_were(
         narrow(self, active)
 
     monkeypatch.setattr(CpuSession, "narrow", counted)
+    monkeypatch.setattr(optimise_module, "MAX_RETAINED_SHARE", 0.95)  # few of so few rows can leave
     witness = Witness(monkeypatch)
     settings = {"motion": "still", "stream__epochs": 4}
     encode(tmp_path / "o", source=world, method="s2gs-edge", **settings)

@@ -32,11 +32,13 @@ from gsstream.core.changes import (
     Motion,
     Residual,
     RowEdit,
+    Scene,
     add_as_nodes,
     apply_delta,
     apply_motion,
     apply_residual,
     gather_rows,
+    groups_for,
     sent_rows,
 )
 from gsstream.evaluation.stream_stats import stream_stats
@@ -50,6 +52,7 @@ from gsstream.packet import (
     encode_key,
 )
 from gsstream.packet.changes.motion import encode_motions
+from gsstream.packet.state import MOST_SKIPPED
 from gsstream.player.playback import Playback
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -339,3 +342,39 @@ def test_sections_of_other_motions_are_not_taken() -> None:
     residual = make_delta(rng, state.layout)
     wanted = encode_delta(residual, state.layout, state.decoders, frame=1).data
     assert encode_delta(residual, state.layout, state.decoders, frame=1, known=known).data == wanted
+
+
+@settings(max_examples=30, deadline=None)
+@given(SEEDS, st.lists(st.integers(0, MOST_SKIPPED + 1), min_size=1, max_size=4))
+@example(0, [0, 1, 0])
+@example(0, [MOST_SKIPPED, MOST_SKIPPED + 1])
+def test_what_moves_steadily_is_heading_where_it_goes_whatever_was_skipped(seed: int, skipped: list[int]) -> None:
+    """Between two frames that are sent lie some that are skipped: an independent count of the way."""
+    rng = np.random.default_rng(seed)
+    state = decode_packet(None, encode_key(make_key(rng, 6, 2)).data)
+    assert (state.scene.heading, state.empty) == (None, 0)
+    way = 2.0**-4 * rng.integers(1, 9, 3)  # a frame's; sums of it are exact
+    for empty in skipped:
+        has_moved = state.scene.displacement is not None
+        for number in range(1, empty + 1):
+            state = decode_packet(state, encode_empty(frame=state.frame + 1).data)
+            assert state.empty == number
+            assert state.scene.displacement is None
+            if not has_moved or number > MOST_SKIPPED:
+                assert state.scene.heading is None
+            else:
+                gone = state.scene.heading.translation
+                np.testing.assert_allclose(gone, np.tile((number + 1) * way, (6, 1)), atol=1e-5)
+        predicted = 0 if state.scene.displacement is None else state.scene.displacement.translation[0]
+        delta = Delta((every_group(state.scene, (empty + 1) * way - predicted),))
+        state = decode_packet(state, encode_delta(delta, state.layout, state.decoders, frame=state.frame + 1).data)
+        ahead = state.scene.heading if empty else state.scene.displacement
+        np.testing.assert_allclose(ahead.translation, np.tile(way, (6, 1)), atol=1e-5)
+        assert (state.empty, state.scene.heading is None) == (0, empty == 0)
+
+
+def every_group(scene: Scene, correction: np.ndarray) -> Motion:
+    """All rows move; their prediction is corrected by a shift in sixteenths."""
+    groups = groups_for(scene, 1e6, 1).count
+    symbols = np.concatenate([np.rint(correction * 16), np.zeros(3)]).astype(np.int32)
+    return Motion(1e6, 1, np.ones(groups, np.uint8), np.tile(symbols, (groups, 1)), 2.0**-4, 2.0**-4)

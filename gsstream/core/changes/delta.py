@@ -111,7 +111,7 @@ def apply_delta(scene: Scene, delta: Delta) -> Scene:
     if delta.residual is not None:
         after = replace(after, gaussians=apply_residual(after.gaussians, after.layout, delta.residual))
         touched = union_rows(len(after.gaussians), touched, sent_rows(after.layout, delta.residual.gates))
-    after = replace(after, displacement=displacement_between(scene.gaussians, after.gaussians, touched))
+    after = replace(after, displacement=displacement_between(scene.gaussians, after.gaussians, touched), heading=None)
     return after if delta.row_edit is None else apply_row_edit(after, delta.row_edit)
 
 

@@ -30,6 +30,10 @@ class Displacement:
         group = np.searchsorted(self.rows, source[kept])
         return Displacement(kept, self.translation[group], self.rotation[group])
 
+    def times(self, share: float) -> Displacement:
+        """Return what goes so much farther, as far as small turns add up."""
+        return Displacement(self.rows, self.translation * np.float32(share), self.rotation * np.float32(share))
+
 
 def displacement_between(
     before: Gaussians[FloatArray], after: Gaussians[FloatArray], rows: IntArray

@@ -88,9 +88,12 @@ class Scene:
         layout: nodes and units of the rows.
         displacement: how far rows were displaced by the last frame; None: nothing moved, or a key packet came last.
         groups: the groups of the last motion; None until there is a motion after the last key packet.
+        heading: where packets were empty, how far rows will have gone from this scene by the next frame if they go on
+            as they did; no motion is predicted from it. None: as ``displacement`` says.
     """
 
     gaussians: Gaussians[FloatArray]
     layout: Layout
     displacement: Displacement | None = None
     groups: Groups | None = None
+    heading: Displacement | None = None

@@ -76,9 +76,7 @@ def _triangulate(frame: Frame, tell: Tell) -> PointCloud:
     return triangulate_points(frame.images, frame.cameras, tell=tell)
 
 
-def _sweep(
-    frame: Frame, settings: FirstFrame, tell: Tell, source: Source | None, device: torch.device
-) -> PointCloud:
+def _sweep(frame: Frame, settings: FirstFrame, tell: Tell, source: Source | None, device: torch.device) -> PointCloud:
     """Points that several training views agree on, found at most SWEEP_WIDTH pixels wide (time grows with pixels)."""
     small = shrink_frame(frame, -(-frame.cameras.width // SWEEP_WIDTH))
     known = None

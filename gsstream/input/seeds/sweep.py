@@ -153,9 +153,7 @@ def _matching_cost(
     return cost
 
 
-def _plane_map(
-    cameras: Cameras, view: int, partner: int, device: torch.device
-) -> tuple[torch.Tensor, torch.Tensor]:
+def _plane_map(cameras: Cameras, view: int, partner: int, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
     """A pixel at inverse depth q lands in the partner at (A + q b), homogeneous, image = [-1, 1]; A [3, HW], b [3]."""
     relative = cameras.viewmats[partner] @ np.linalg.inv(cameras.viewmats[view])
     to_unit = np.array([[2 / cameras.width, 0, -1], [0, 2 / cameras.height, -1], [0, 0, 1.0]])

@@ -10,7 +10,6 @@ import torch
 
 from gsstream.core.processors import processors
 
-
 #: More threads than this wait for each other between their small operations: sixteen of them take three times as long.
 MOST = 4
 
@@ -23,7 +22,9 @@ def one_thread_each(workers: int = 0) -> Iterator[ThreadPoolExecutor]:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with ThreadPoolExecutor(workers or min(processors(), MOST), initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        with ThreadPoolExecutor(
+            workers or min(processors(), MOST), initializer=torch.set_num_threads, initargs=(1,)
+        ) as pool:
             yield pool
     finally:
         torch.set_num_threads(threads)

@@ -39,8 +39,8 @@ class Rigid(MotionPart):
     A few passes over the training cameras move the groups' six numbers each, by damped Gauss-Newton steps after every
     view; only the Gaussians of groups that lie in what changed are rendered anew. After the first pass neighbouring
     groups whose motions agree are joined to bodies, which hold their groups from then on. A group that ends within
-    ``least`` pixels of where it stood is left alone. After a key packet a fit begins where the scene before that was
-    heading, while the motion is coded as one from rest.
+    ``least`` pixels of where it stood is left alone. After a key packet, and after frames that were skipped, a fit
+    begins where the scene was heading, while the motion is coded as one from rest.
     """
 
     class Config(PartConfig):
@@ -73,8 +73,7 @@ class Rigid(MotionPart):
     traits: ClassVar[MotionTraits] = MotionTraits(finds_motion=True, momentum=1.0)
 
     def propose(self, scene: Scene, work: FitContext, rng: Rng, memory: Any = None) -> tuple[Motion, ...]:
-        config = self.config
-        side = config.pixels * enlargement(work.cameras.width)
+        config, side = self.config, self.config.pixels * enlargement(work.cameras.width)
         groups = known_groups(scene, work.cameras, side, BRIGHTNESS_BINS)
         able = changed_groups(groups, work, config.votes, config.share)
         if not able.any():
@@ -84,13 +83,13 @@ class Rigid(MotionPart):
         # pixel is measured once, when its groups are formed.
         unit = np.array([groups.cell / side] * 3 + [1 / side] * 3)
         start = begin = predict_transforms(scene, groups, able.astype(np.uint8), predicted=True)
-        if isinstance(memory, Displacement):
+        if (ahead := memory if isinstance(memory, Displacement) else scene.heading) is not None:
             begin = predict_transforms(
-                replace(scene, displacement=memory), groups, able.astype(np.uint8), predicted=True
+                replace(scene, displacement=ahead), groups, able.astype(np.uint8), predicted=True
             )
-        found = self._fitted(work, begin, unit, rest=scene.displacement is None, rng=rng)
-        step = (config.step * unit).astype(np.float32).astype(np.float64)
+        found = self._fitted(work, begin, unit, rest=scene.displacement is None and scene.heading is None, rng=rng)
         predicted = np.concatenate([start.translation, start.rotation], 1)
+        step = (config.step * unit).astype(np.float32).astype(np.float64)
         symbols = np.rint((found - predicted) / step).astype(np.int32)
         kept = np.abs((predicted + symbols * step) / unit).max(1) >= config.least
         moving = np.bincount(np.flatnonzero(able)[kept], minlength=groups.count).astype(np.uint8)

@@ -74,6 +74,15 @@ def test_a_scene_that_did_not_move_hands_nothing_on(without: str) -> None:
     assert displacement_across_key(replace(before, **{without: None}), key_of(before, np.arange(5))) is None
 
 
+def test_what_was_skipped_before_a_key_packet_counts() -> None:
+    before = moved_scene(30)
+    longer = before.displacement.times(3.0)
+    skipped = replace(before, displacement=None, heading=longer)
+    found = displacement_across_key(skipped, key_of(replace(before, displacement=longer), np.arange(30)))
+    assert found is not None
+    assert len(found.rows) == 30
+
+
 def test_places_far_outside_the_grid_are_places_too() -> None:
     """Cells beyond the grid are one cell, here as where groups are formed."""
     far = np.full((4, 3), 1e30, np.float32)
@@ -98,6 +107,24 @@ def test_a_fast_body_is_found_after_a_key_packet_where_it_is_found_before_one() 
 
     assert pixels_off(part.across_key(moving, key)) < 0.5
     assert pixels_off(None) > 2.0, "the case asks for what the part keeps"
+
+
+def test_a_fast_body_is_found_after_frames_that_were_skipped() -> None:
+    """It moved by three pixels a frame and two frames were skipped; the one after them moves by three pixels again."""
+    part, step = Rigid(), bodies.shifted((3.0, 0.0, 0.0), (0.0, -3.0, 0.0))
+    before = bodies.two_bodies()
+    scene = replace(before, groups=groups_for(before, 0.6, BINS))
+
+    def pixels_off(shift: np.ndarray, displaced: np.ndarray | None, heading: np.ndarray | None) -> float:
+        last, ahead = (
+            None if way is None else Displacement(np.arange(80), way, 0 * way) for way in (displaced, heading)
+        )
+        found = bodies.after_motion(part, replace(scene, displacement=last, heading=ahead), shift)
+        return float(np.abs((found - before.gaussians.means - shift).reshape(2, 40, 3).mean(1)).max()) * bodies.PIXELS
+
+    assert pixels_off(3 * step, None, 3 * step) < 0.5
+    assert pixels_off(3 * step, None, None) > 2.0, "the case asks for where bodies are heading"
+    assert pixels_off(step, 3 * step, step) < 0.5
 
 
 def test_a_player_that_begins_with_the_key_packet_decodes_the_same_motion() -> None:

@@ -103,7 +103,6 @@ def _heading_on(state: PlayerState) -> Displacement | None:
     The packet says that nothing changed or that its frame was skipped: what moved has stopped, or is ever farther from
     where the scene has it.
     """
-    moved = state.scene.heading or state.scene.displacement
-    if moved is None or state.empty >= MOST_SKIPPED:
+    if state.scene.ahead is None or state.empty >= MOST_SKIPPED:
         return None
-    return moved.times((state.empty + 2) / (state.empty + 1))
+    return state.scene.ahead.times((state.empty + 2) / (state.empty + 1))

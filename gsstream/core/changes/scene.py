@@ -97,3 +97,8 @@ class Scene:
     displacement: Displacement | None = None
     groups: Groups | None = None
     heading: Displacement | None = None
+
+    @property
+    def ahead(self) -> Displacement | None:
+        """How far rows will have gone by the next frame if they go on as they did; None: as far as known, nowhere."""
+        return self.displacement if self.heading is None else self.heading

@@ -22,7 +22,7 @@ def displacement_across_key(replaced: Scene, scene: Scene) -> Displacement | Non
         replaced: decoded, of the frame before the key packet.
         scene: that of the key packet, decoded.
     """
-    moved, groups = replaced.heading or replaced.displacement, replaced.groups
+    moved, groups = replaced.ahead, replaced.groups
     if moved is None or groups is None:
         return None
     old = replaced.gaussians.rows(moved.rows)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from gsstream_hicom.motion import CoherentMotion, cell_sides
 
 from gsstream.api import Rng, Scene, apply_motion
 from gsstream.parts.growth.copying import high_gradient_rows
+from gsstream.testing import motion as bodies
 from tests.scenes import RIG, SquaredDistances, scene_at
 
 RNG = np.random.default_rng(0)
@@ -58,3 +60,12 @@ def test_copies_are_made_where_the_gradient_in_half_widths_exceeds_the_bound() -
     assert high_gradient_rows(Shown(), 0.01).tolist() == [1, 0], "0.16 and 0.012; the largest first"
     assert high_gradient_rows(Shown(), 0.1).tolist() == [1]
     assert high_gradient_rows(Shown(), 0.2).tolist() == []
+
+
+def test_where_frames_were_skipped_a_fit_begins_with_the_way_of_all_of_them() -> None:
+    part, last = CoherentMotion(), bodies.shifted((1.5, 0.8, 0), (-1.0, 0.7, 0))
+    seen = bodies.invisible(bodies.two_bodies(), last)
+    skipped = replace(seen, displacement=None, heading=seen.displacement)
+    found = bodies.after_motion(part, skipped, last, everywhere=True) - seen.gaussians.means
+    share = np.float32(part.claims().momentum)
+    assert np.abs(found - share * last).max() * bodies.PIXELS <= bodies.TOLERANCE

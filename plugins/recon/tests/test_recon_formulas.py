@@ -13,6 +13,7 @@ from gsstream.api import Delta, Layout, Rng, Scene, apply_motion
 from gsstream.blocks import pixel_size
 from gsstream.core.changes import Displacement
 from gsstream.testing import MethodUnderTest
+from gsstream.testing import motion as bodies
 from tests.scenes import RIG, SquaredDistances, scene_at
 
 RNG = np.random.default_rng(0)
@@ -124,3 +125,12 @@ def test_anchors_stay_with_their_gaussians_and_a_resumed_run_finds_them() -> Non
     for player in (state.player for state in states[1:]):
         memory = motion.follow(memory, player.frame, player.before, player.delta, rng)
     assert [rows.tolist() for rows in memory.rows] == [rows.tolist() for rows in states[-1].motion_memory.rows]
+
+
+def test_where_frames_were_skipped_a_fit_begins_with_the_way_of_all_of_them() -> None:
+    part, last = AnchorMotion(), bodies.shifted((1.5, 0.8, 0), (-1.0, 0.7, 0))
+    seen = bodies.invisible(bodies.two_bodies(), last)
+    skipped = replace(seen, displacement=None, heading=seen.displacement)
+    found = bodies.after_motion(part, skipped, last, everywhere=True) - seen.gaussians.means
+    share = np.float32(part.claims().momentum)
+    assert np.abs(found - share * last).max() * bodies.PIXELS <= bodies.TOLERANCE

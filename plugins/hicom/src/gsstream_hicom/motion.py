@@ -116,10 +116,10 @@ def _warm_started(
     scene: Scene, start: Scene, transforms: GroupTransforms[FloatArray], momentum: float
 ) -> GroupTransforms[FloatArray]:
     """Return transforms that begin with a share of the last motion, less the motion by which coarser cells moved."""
-    if start.displacement is None or momentum == 0:
+    if start.ahead is None or momentum == 0:
         return transforms
     past: FloatArray = np.zeros((len(scene.gaussians), 3))
-    past[start.displacement.rows] = momentum * start.displacement.translation
+    past[start.ahead.rows] = momentum * start.ahead.translation
     left = (past - (scene.gaussians.means.astype(np.float64) - start.gaussians.means))[transforms.rows]
     counts = np.bincount(transforms.group, minlength=len(transforms.center))
     columns = [np.bincount(transforms.group, left[:, i], len(transforms.center)) / counts for i in range(3)]

@@ -148,10 +148,10 @@ class AnchorMotion(MotionPart):
     ) -> list[FloatArray]:
         """Motions [K, 6] of the anchors that begin with a share of the last frame's."""
         cells, levels = anchored.cells, anchored.levels
-        if scene.displacement is None or before is None or not all(map(len, before.rows)):
+        if scene.ahead is None or before is None or not all(map(len, before.rows)):
             return [np.zeros((len(level.at), 6)) for level in levels]
         past: FloatArray = np.zeros((len(scene.gaussians), 6))
-        past[scene.displacement.rows] = np.concatenate([scene.displacement.translation, scene.displacement.rotation], 1)
+        past[scene.ahead.rows] = np.concatenate([scene.ahead.translation, scene.ahead.rotation], 1)
         mean = Level(cells.center, cells.group).mean(past[cells.rows])
         old = levels if before is now else bound(cells.center, scene.gaussians.means, before)
         return [self.config.momentum * motion for motion in inherited(mean, old, levels, NEIGHBOURS)]

@@ -53,7 +53,8 @@ class TrainedGates:
         return self._ahead.pop(0) if self._ahead else self._noise()
 
     def sample(self, noise: torch.Tensor | None, frozen: torch.Tensor | None) -> torch.Tensor:
-        per_row = self.gate.sample(self.logits, noise)[self.node_of]
+        # Selected and not indexed: on a GPU the gradient of an index sorts, that of a selection adds.
+        per_row = self.gate.sample(self.logits, noise).index_select(0, self.node_of)
         return per_row if frozen is None else per_row * ~frozen
 
     def step(

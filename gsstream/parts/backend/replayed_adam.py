@@ -12,7 +12,7 @@ from gsstream.parts.backend.adam import ReferenceAdam
 from gsstream.parts.render.replay import Recorder, RecordError, Records
 from gsstream.parts.residual.adam_state import AdamState
 from gsstream.parts.residual.layout import JointLayout
-from gsstream.parts.residual.optimiser import ResidualOptimiser
+from gsstream.parts.residual.optimiser import Gates, ResidualOptimiser
 from gsstream.parts.residual.replayed import ReplayedResidualOptimiser
 
 NAME = "steps of Adam"
@@ -77,4 +77,10 @@ class ReplayedAdam(ReferenceAdam):
     def residual_optimiser(
         self, code: JointLayout, base: Gaussians[torch.Tensor], units: torch.Tensor, matrix: torch.Tensor
     ) -> ResidualOptimiser[Any]:
-        return ReplayedResidualOptimiser(code=code, base=base, units=units, matrix=matrix, optimiser=self)
+        return ReplayedResidualOptimiser(
+            code=code, base=base, units=units, matrix=matrix, optimiser=self, known_gates=self.known_gates
+        )
+
+    def known_gates(self, gates: Gates) -> Gates:
+        """Return gates of which all rows are trained; an override may take fewer operations for the same numbers."""
+        return gates

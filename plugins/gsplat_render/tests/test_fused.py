@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from gsstream_gsplat_render import adam, boxes, loss, rate
+from gsstream_gsplat_render import adam, boxes, gates, loss, rate
 from gsstream_gsplat_render.fused import FusedAdam, FusedLoss, load_fused
 from torch_kernels import TORCH_FUSED
 
@@ -142,6 +142,30 @@ def test_the_rate_is_that_of_the_reference(shape: tuple[int, int], as_tensor: bo
     assert torch.equal(found.cpu()[gates == 0], before[gates == 0])
 
 
+@pytest.mark.parametrize("levels", [1, 4, 255])
+@pytest.mark.parametrize(("rows", "nodes"), [(1, 1), (300, 40), (300, 1), (5, 700)])
+def test_gates_and_their_gradients_are_those_of_the_closed_forms(rows: int, nodes: int, levels: int) -> None:
+    g = torch.Generator().manual_seed(rows + levels)
+    logits = torch.empty(nodes).uniform_(-12, 12, generator=g)
+    logits[0] = 90.0  # beyond what an exponential holds
+    node_of = torch.randint(0, nodes, (rows,), generator=g)
+    latents, by_gate = torch.randn(rows, 7, generator=g), 100 * torch.randn(rows, generator=g)
+    logits, node_of, latents, by_gate = (value.to(DEVICE) for value in (logits, node_of, latents, by_gate))
+    for offset in (0.0, 100.0):
+        found = FUSED.open_gates(logits, node_of, 0.7, offset, levels)
+        wanted = TORCH_FUSED.open_gates(logits, node_of, 0.7, offset, levels)
+        assert torch.allclose(found[0] * levels, wanted[0] * levels, atol=1.0 if levels == 255 else 0.0)
+        assert (found[0] == wanted[0]).float().mean() > 0.95
+        assert ((found[0] * levels).round() / levels == found[0]).all()
+        assert torch.allclose(found[1], wanted[1], rtol=1e-5, atol=1e-12)
+    given = by_gate, wanted[1], latents[:, 2:5], logits, node_of, -0.4
+    for weights in ((0.3, 0.0), (1e-4, 2.5)):
+        by_logit, by_position = FUSED.gate_gradients(*given, *weights)
+        want_logit, want_position = TORCH_FUSED.gate_gradients(*given, *weights)
+        assert torch.allclose(by_logit, want_logit, rtol=1e-5, atol=1e-4)
+        assert torch.allclose(by_position, want_position, rtol=1e-5, atol=1e-9)
+
+
 def test_where_triton_cannot_compile_the_reference_is_used_with_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*_: Any) -> Any:
         raise RuntimeError("Python.h: No such file or directory")
@@ -178,7 +202,7 @@ def test_the_contract_of_a_loss_and_of_an_optimiser(check: Any) -> None:
     check(Brings())
 
 
-@pytest.mark.parametrize("module", [adam, boxes, rate], ids=lambda module: module.__name__.split(".")[-1])
+@pytest.mark.parametrize("module", [adam, boxes, gates, rate], ids=lambda module: module.__name__.split(".")[-1])
 def test_no_kernel_is_compiled_anew_for_another_number_of_rows(module: Any) -> None:
     """Triton compiles once more where a number becomes 1 or divisible by 16, unless it is told not to."""
     by_rows = {"size", "count", "parts", "last", "halvings"}
@@ -195,14 +219,15 @@ import sys
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from gsstream_gsplat_render import adam, boxes, loss, rate
+from gsstream_gsplat_render import adam, boxes, gates, loss, rate
 
 KINDS = {"target": "*u8", "tiles": "*u8", "steps": "*i32", "visible": "*u8", "table": "*u8", "places": "*i16"}
-KINDS |= dict.fromkeys("near ends most active".split(), "*i64")
+KINDS |= dict.fromkeys("near ends most active node_of".split(), "*i64")
 KINDS |= dict.fromkeys("radii boxes areas owners".split(), "*i32")
 POINTERS = "image weights sums grads out values gradients first second corrections rates".split()
-POINTERS += "means scales latents gates".split()
-NUMBERS = "dssim scale rate slow slower weight least ln2".split()
+POINTERS += "means scales latents gates logits opened slopes by_gate position by_logit by_position".split()
+NUMBERS = "dssim scale rate slow slower weight least ln2 temperature offset levels".split()
+NUMBERS += "open_logit open_weight displacement_weight".split()
 
 def compiled(function, **constants):
     kinds = {**KINDS, **dict.fromkeys(POINTERS, "*fp32"), **dict.fromkeys(NUMBERS, "fp32")}
@@ -214,7 +239,7 @@ found = [compiled(adam._move, as_table=True, block=512)]
 found += [compiled(kernel, as_bytes=True, all_tiles=False) for kernel in (loss._compare, loss._pull_back)]
 found += [compiled(boxes._find, side=16, block=256), compiled(boxes._cover, wide=32)]
 found += [compiled(rate._sum, rows=256, wide=16), compiled(rate._price, as_tensor=True, rows=256, wide=16)]
-found += [compiled(kernel, block=256) for kernel in (boxes._count, boxes._list)]
+found += [compiled(kernel, block=256) for kernel in (boxes._count, boxes._list, gates._open, gates._pull)]
 assert all(code[:4] == b"\\x7fELF" for code in found)
 print(len(found))
 """
@@ -228,4 +253,4 @@ def test_the_kernels_compile_for_a_gpu_that_is_not_here(architecture: str, tmp_p
         [sys.executable, "-W", "ignore", "-c", COMPILE, architecture], env=environment, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split()[-1] == "9"
+    assert done.stdout.split()[-1] == "11"

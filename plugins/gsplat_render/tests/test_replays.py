@@ -15,6 +15,7 @@ from gsstream.core.deferred import deferred_checks, require
 from gsstream.core.errors import ShapeError
 from gsstream.core.frame import Frame
 from gsstream.input.recordings.open import open_source
+from gsstream.parts.gate.base import SampledGate
 from gsstream.parts.render.replay import RecordError, Records
 from gsstream.testing.method_driver import SOURCE
 from gsstream.testing.pretend import PretendDevice, PretendRecorder
@@ -151,6 +152,7 @@ def test_a_gate_that_reads_a_value_is_queued_and_gives_the_same_packets(
         return sample(self, logits, noise)
 
     monkeypatch.setattr(gate, "sample", reading)
+    monkeypatch.setattr(gate, "form", lambda _: SampledGate())
     with PretendDevice():
         found = packets(frames, DEVICE)
     assert f"iterations with {gate.__name__}" in refused

@@ -15,7 +15,10 @@ from gsstream_gsplat_render.fused import Fused
 from gsstream_gsplat_render.kernels import Kernels
 from gsstream_gsplat_render.tiles import IN_TORCH
 
+from gsstream.core.hierarchy import Hierarchy
 from gsstream.parts.backend.adam import ReferenceAdam
+from gsstream.parts.gate.base import AnalyticGate
+from gsstream.parts.regularizer.base import AnalyticPenalty
 from gsstream.parts.render.loss import ReferenceLoss, _windowed, ssim_and_grads
 from gsstream.parts.residual.adam_state import AdamState
 from gsstream.parts.residual.rate import MIN_SPREAD, laplace_gradient
@@ -254,4 +257,41 @@ def add_rate(
     gradient.add_(laplace_gradient(latents, steps, spread, weight) * (gates > 0)[:, None])
 
 
-TORCH_FUSED = Fused("cpu", loss_by_tile, gradient_by_pixel, move_table, sum_symbols, add_rate, tiles=IN_TORCH)
+def open_gates(
+    logits: torch.Tensor, node_of: torch.Tensor, temperature: float, offset: float, levels: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    form = AnalyticGate(temperature, levels, 0.0, torch.inf, logit_offset=offset)
+    opened, slopes = form.gates(logits)
+    return opened[node_of], slopes[node_of]
+
+
+def gate_gradients(
+    by_gate: torch.Tensor,
+    slopes: torch.Tensor,
+    position: torch.Tensor,
+    logits: torch.Tensor,
+    node_of: torch.Tensor,
+    open_logit: float,
+    open_weight: float,
+    displacement_weight: float,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    probability, slope = AnalyticGate(1.0, 1, open_logit, torch.inf).probability(logits)
+    rows = Hierarchy(node_of, torch.arange(len(logits)), torch.zeros(len(logits), dtype=torch.int64))
+    by_probability, by_position = AnalyticPenalty(open_weight, displacement_weight, mean=False).grad(
+        probability, position, rows, len(node_of)
+    )
+    by_images = torch.zeros_like(logits).index_add_(0, node_of, by_gate * slopes)
+    return by_images + by_probability * slope, by_position
+
+
+TORCH_FUSED = Fused(
+    "cpu",
+    loss_by_tile,
+    gradient_by_pixel,
+    move_table,
+    sum_symbols,
+    add_rate,
+    open_gates,
+    gate_gradients,
+    tiles=IN_TORCH,
+)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from typing import Any, final
 
 import torch
 
+from gsstream.api import AnalyticGate, AnalyticPenalty, ShapeError
 from gsstream.backend import AdamState, Loss
 from gsstream.replay import Recorder, ReplayedAdam
 from gsstream_gsplat_render.tiles import Grid, TileKernels, tile_lists
@@ -22,7 +24,8 @@ from gsstream_gsplat_render.tiles import Grid, TileKernels, tile_lists
 
 @dataclass(frozen=True, slots=True)
 class Fused:
-    """Functions of one launch each, with the signatures of ``loss.py``, ``adam.py``, ``rate.py``, ``tiles.py``.
+    """Functions of one launch each, with the signatures of ``loss.py``, ``adam.py``, ``rate.py``, ``gates.py`` and
+    ``tiles.py``.
 
     ``device``: the type of the device that they run on. What lies elsewhere is computed as the reference does it.
     """
@@ -33,6 +36,8 @@ class Fused:
     move_table: Callable[..., Any]
     sum_symbols: Callable[..., Any]
     add_rate: Callable[..., Any]
+    open_gates: Callable[..., Any]
+    gate_gradients: Callable[..., Any]
     tiles: TileKernels
 
     def serves(self, tensor: torch.Tensor) -> bool:
@@ -50,6 +55,7 @@ def load_fused(device: str) -> Fused | None:
         return None
     from gsstream_gsplat_render import boxes
     from gsstream_gsplat_render.adam import move_table
+    from gsstream_gsplat_render.gates import gate_gradients, open_gates
     from gsstream_gsplat_render.loss import gradient_by_pixel, loss_by_tile
     from gsstream_gsplat_render.rate import add_rate, sum_symbols
 
@@ -63,6 +69,9 @@ def load_fused(device: str) -> Fused | None:
             move_table(image[0, :1], image[1, :1], image[2, :1], image[3, :1], steps, corrections, lr)
             sums = sum_symbols(image[5], corrections.flatten()[:3])
             add_rate(image[4], image[5], corrections.flatten()[:3], image[6, :, 0], sums, lr)
+        rows = torch.zeros(2, dtype=torch.int64, device=device)
+        opened, slopes = open_gates(image[7, 0], rows, 1.0, 0.0, 1)
+        gate_gradients(opened, slopes, image[8, :2], image[7, 0], rows, 0.0, 1.0, 1.0)
         lists = TileKernels(boxes.find_boxes, boxes.count_entries, boxes.list_entries, boxes.cover_tiles)
         _try_tiles(lists, torch.device(device))
     except Exception as error:  # compilers and drivers of strangers fail in any way
@@ -80,6 +89,8 @@ def load_fused(device: str) -> Fused | None:
         move_table=move_table,
         sum_symbols=sum_symbols,
         add_rate=add_rate,
+        open_gates=open_gates,
+        gate_gradients=gate_gradients,
         tiles=lists,
     )
 
@@ -161,3 +172,60 @@ class FusedAdam(ReplayedAdam):
         elif latents.numel():
             sums = self._fused.sum_symbols(latents, steps)
             self._fused.add_rate(gradient, latents, steps, gates, sums, weight)
+
+    def known_gates(self, gates: Any) -> Any:
+        if not self._fused.serves(gates.logits):
+            return gates
+        match gates.gate.form(), gates.regularizer.form():
+            case AnalyticGate() as form, AnalyticPenalty() as penalty:
+                return FusedGates(gates, form, penalty, fused=self._fused, optimiser=self)
+            case _:
+                return gates
+
+
+@final
+class FusedGates:
+    """Gates whose gate and penalty are known in closed form: no graph is built for them.
+
+    Arguments:
+        gates: whose logits, rows and Adam state these are.
+        form, penalty: of their parts.
+        fused: the kernels. optimiser: moves the logits.
+    """
+
+    def __init__(
+        self, gates: Any, form: AnalyticGate, penalty: AnalyticPenalty, *, fused: Fused, optimiser: FusedAdam
+    ) -> None:
+        self._gates, self._form, self._penalty = gates, form, penalty
+        self._fused, self._optimiser = fused, optimiser
+        self.gate, self.regularizer = gates.gate, gates.regularizer
+        self.logits, self.state, self.lr = gates.logits, gates.state, gates.lr
+        self.node_of, self.num_gaussians = gates.node_of, gates.num_gaussians
+
+    def noise(self) -> torch.Tensor | None:
+        noise: torch.Tensor | None = self._gates.noise()
+        return noise
+
+    def sample(self, noise: torch.Tensor | None, frozen: torch.Tensor | None) -> torch.Tensor:
+        if noise is not None or frozen is not None:
+            raise ShapeError("gates in closed form: expected no noise and no row that waits, got one")
+        form, logits = self._form, self.logits.detach()
+        numbers = form.temperature, form.logit_offset, form.levels
+        opened: torch.Tensor
+        opened, self._slopes = self._fused.open_gates(logits, self.node_of, *numbers)
+        return opened
+
+    def step(
+        self, gates: torch.Tensor, by_gate: torch.Tensor, position: torch.Tensor, frozen: torch.Tensor | None
+    ) -> None:
+        divisor = max(self.num_gaussians, 1) if self._penalty.mean else 1
+        weights = self._penalty.open_weight / divisor, self._penalty.displacement_weight / divisor
+        logits = self.logits.detach()
+        by_logit, by_position = self._fused.gate_gradients(
+            by_gate, self._slopes, position.detach(), logits, self.node_of, self._form.open_logit, *weights
+        )
+        if position.requires_grad and weights[1]:
+            torch.autograd.backward([position], [by_position])
+        self._optimiser.step({"": logits}, {"": by_logit}, {"": self.state}, {"": self.lr})
+        if self._form.bound < math.inf:
+            logits.clamp_(-self._form.bound, self._form.bound)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
+from functools import partial
 
 import torch
 
-from gsstream.core.deferred import require
+from gsstream.core.deferred import are_deferred, require
 from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import check_finite, check_shape
 from gsstream.parts.backend.row_optimiser import RowOptimiser
@@ -30,9 +31,17 @@ class ReferenceAdam(RowOptimiser):
         for name, gradient in gradients.items():
             value, state = values[name].detach(), states[name]
             check_shape(f"gradient of {name}", gradient, tuple(value.shape))
-            _check_size(name, gradient)
+            # Where an error is raised at once, the table stays as it was.
+            if not (are_deferred() and self.looks(value)):
+                _check_size(name, gradient)
             state.steps.add_(1)
-            self.move(value, gradient, state, bias_corrections(value.device), lr=lrs[name])
+            is_well = self.move(value, gradient, state, bias_corrections(value.device), lr=lrs[name])
+            if is_well is not None:
+                require(is_well, partial(_too_large, name))
+
+    def looks(self, value: torch.Tensor) -> bool:
+        """Say whether :meth:`move` looks at the gradient of such a table itself, in the same visit."""
+        return False
 
     def move(
         self,
@@ -41,12 +50,15 @@ class ReferenceAdam(RowOptimiser):
         state: AdamState,
         corrections: torch.Tensor,
         lr: float | torch.Tensor,
-    ) -> None:
-        """Move a table [n, ...] and both of its moments in place, given a gradient that was checked.
+    ) -> torch.Tensor | None:
+        """Move a table [n, ...] and both of its moments in place.
 
         Arguments:
             value: the table. gradient: of its shape. state: its steps count this one already.
             corrections: :func:`bias_corrections`. lr: a number, or a tensor that broadcasts to the table.
+
+        Returns:
+            [] bool, that no gradient is beyond MAX_GRADIENT, where this looks; None: it was looked at before.
         """
         state.exp_avg.lerp_(gradient, 1 - ADAM_BETAS[0])
         state.exp_avg_sq.mul_(ADAM_BETAS[1]).addcmul_(gradient, gradient, value=1 - ADAM_BETAS[1])
@@ -57,6 +69,7 @@ class ReferenceAdam(RowOptimiser):
             value.addcdiv_(step.mul_(lr), denominator, value=-1)
         else:
             value.addcdiv_(step, denominator, value=-lr)
+        return None
 
 
 @functools.cache
@@ -72,11 +85,14 @@ def bias_corrections(device: torch.device) -> torch.Tensor:
     return torch.stack([second.sqrt() / first, ADAM_EPS * second.sqrt()], 1).float().to(device)
 
 
+def _too_large(name: str) -> ShapeError:
+    return ShapeError(f"gradient of {name}: expected finite magnitudes up to {MAX_GRADIENT:g}, got one that is not")
+
+
 def _check_size(name: str, gradient: torch.Tensor) -> None:
     if gradient.device.type != "cpu":
-        message = f"gradient of {name}: expected finite magnitudes up to {MAX_GRADIENT:g}, got one that is not"
         largest = torch.linalg.vector_norm(gradient, torch.inf) if gradient.numel() else gradient.new_zeros(())
-        require(largest <= MAX_GRADIENT, lambda: ShapeError(message))
+        require(largest <= MAX_GRADIENT, partial(_too_large, name))
         return
     check_finite(f"gradient of {name}", gradient)
     bad = gradient.abs() > MAX_GRADIENT

@@ -38,7 +38,7 @@ def decode_joint(code: JointLayout, latents: torch.Tensor, matrix: torch.Tensor,
     quantised = torch.round(latents / code.steps).mul_(code.steps)
     decoded = quantised @ matrix
     if "means" in code.feature:
-        decoded[:, code.feature["means"]] *= units[:, None]
+        decoded[:, code.feature["means"]].mul_(units[:, None])
     return JointResidual(quantised, decoded)
 
 
@@ -92,5 +92,5 @@ def joint_vjp(
     by_gate = (upstream * change.decoded).sum(1)
     gated = upstream * gates[:, None]
     if "means" in code.feature:
-        gated[:, code.feature["means"]] *= units[:, None]
+        gated[:, code.feature["means"]].mul_(units[:, None])
     return JointGrad(gated @ matrix.T, (change.latents.T @ gated).mul_(code.trained), by_gate)

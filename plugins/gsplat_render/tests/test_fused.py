@@ -17,6 +17,7 @@ from torch_kernels import TORCH_FUSED
 
 from gsstream.parts.backend.reference import ReferenceRenderer
 from gsstream.parts.render.loss import ReferenceLoss
+from gsstream.parts.residual.adam_state import MAX_GRADIENT
 from gsstream.parts.residual.rate import channel_spread, laplace_gradient
 from gsstream.testing import loss_and_change as loss_checks
 from gsstream.testing import optimiser as optimiser_checks
@@ -112,11 +113,23 @@ def test_a_table_is_moved_as_the_reference_moves_it(lr: str) -> None:
     made += [torch.randn(rows, width, generator=g), torch.rand(rows, width, generator=g)]
     steps = torch.randint(0, 9, (rows,), generator=g, dtype=torch.int32)  # more than the corrections have: the last one
     ours, theirs = ([x.clone().to(DEVICE) for x in (*made, steps)] for _ in range(2))
-    FUSED.move_table(*ours, corrections, rate)
+    assert bool(FUSED.move_table(*ours, corrections, rate))
     TORCH_FUSED.move_table(*theirs, corrections, rate)
     assert torch.equal(ours[4], theirs[4])
     for got, want in zip(ours[:4], theirs[:4], strict=True):
         assert torch.allclose(got, want, rtol=2e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf, -torch.inf, 1.001e18, -2e18])
+def test_a_gradient_that_is_too_large_is_told(wrong: float) -> None:
+    assert adam.MOST == MAX_GRADIENT
+    for at in (0, 511, 512, 2099):
+        value, first, second, gradient = torch.zeros(4, 300, 7, device=DEVICE).unbind()
+        steps, corrections = torch.ones(300, dtype=torch.int32, device=DEVICE), torch.ones(2, 2, device=DEVICE)
+        gradient.fill_(MAX_GRADIENT)
+        assert bool(FUSED.move_table(value, gradient, first, second, steps, corrections, 0.1))
+        gradient.view(-1)[at] = wrong
+        assert not bool(FUSED.move_table(value, gradient, first, second, steps, corrections, 0.1))
 
 
 @pytest.mark.parametrize("as_tensor", [False, True])
@@ -221,12 +234,13 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from gsstream_gsplat_render import adam, boxes, gates, loss, rate
 
-KINDS = {"target": "*u8", "tiles": "*u8", "steps": "*i32", "visible": "*u8", "table": "*u8", "places": "*i16"}
+KINDS = {"target": "*u8", "tiles": "*u8", "steps": "*i32", "visible": "*u8", "table": "*u8", "is_well": "*u8"}
+KINDS |= {"places": "*i16"}
 KINDS |= dict.fromkeys("near ends most active node_of".split(), "*i64")
 KINDS |= dict.fromkeys("radii boxes areas owners".split(), "*i32")
 POINTERS = "image weights sums grads out values gradients first second corrections rates".split()
 POINTERS += "means scales latents gates logits opened slopes by_gate position by_logit by_position".split()
-NUMBERS = "dssim scale rate slow slower weight least ln2 temperature offset levels".split()
+NUMBERS = "limit dssim scale rate slow slower weight least ln2 temperature offset levels".split()
 NUMBERS += "open_logit open_weight displacement_weight".split()
 
 def compiled(function, **constants):

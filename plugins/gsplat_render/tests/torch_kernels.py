@@ -20,7 +20,7 @@ from gsstream.parts.backend.adam import ReferenceAdam
 from gsstream.parts.gate.base import AnalyticGate
 from gsstream.parts.regularizer.base import AnalyticPenalty
 from gsstream.parts.render.loss import ReferenceLoss, _windowed, ssim_and_grads
-from gsstream.parts.residual.adam_state import AdamState
+from gsstream.parts.residual.adam_state import MAX_GRADIENT, AdamState
 from gsstream.parts.residual.rate import MIN_SPREAD, laplace_gradient
 
 NAN = float("nan")
@@ -236,9 +236,10 @@ def move_table(
     steps: torch.Tensor,
     corrections: torch.Tensor,
     lr: float | torch.Tensor,
-) -> None:
+) -> torch.Tensor:
     state = AdamState(exp_avg, exp_avg_sq, steps)
     ReferenceAdam().move(value, gradient, state, corrections, lr=lr)
+    return (gradient.abs() <= MAX_GRADIENT).all()
 
 
 def sum_symbols(latents: torch.Tensor, steps: torch.Tensor) -> torch.Tensor:

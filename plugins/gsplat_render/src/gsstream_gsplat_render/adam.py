@@ -11,8 +11,8 @@ import triton.language as tl
 
 from gsstream.backend import ADAM_BETAS
 
-#: Elements that a program moves.
-BLOCK = 512
+#: Elements that a program moves, and the largest gradient that is taken, which is the reference's.
+BLOCK, MOST = 512, 1e18
 
 
 @triton.jit(do_not_specialize=["size", "last"])
@@ -24,7 +24,9 @@ def _move(
     steps,
     corrections,
     rates,
+    is_well,
     rate,
+    limit,
     size,
     width,
     by_row,
@@ -35,12 +37,19 @@ def _move(
     as_table: tl.constexpr,
     block: tl.constexpr,
 ):
-    """Both moments and the values of ``block`` elements; row i has taken ``steps[i]`` steps, this one included."""
+    """Both moments and the values of ``block`` elements; row i has taken ``steps[i]`` steps, this one included.
+
+    ``is_well`` becomes 0 where a gradient is larger than ``limit``, or not a number.
+    """
     place = tl.program_id(0) * block + tl.arange(0, block)
     there = place < size
     row = place // width
     taken = tl.minimum(tl.load(steps + row, mask=there, other=1), last)
     gradient = tl.load(gradients + place, mask=there, other=0.0)
+    # Not "greater": that is false of what is no number.
+    wrong = tl.where(tl.abs(gradient) <= limit, 0, 1)
+    if tl.max(wrong, 0) > 0:
+        tl.store(is_well, tl.zeros((), tl.uint8))
     mean = tl.load(first + place, mask=there, other=0.0)
     square = tl.load(second + place, mask=there, other=0.0)
     mean += slow * (gradient - mean)
@@ -63,10 +72,14 @@ def move_table(
     steps: torch.Tensor,
     corrections: torch.Tensor,
     lr: float | torch.Tensor,
-) -> None:
-    """Move a table [n, ...] and both of its moments in place, as ``ReferenceAdam.move`` does."""
+) -> torch.Tensor:
+    """Move a table [n, ...] and both of its moments in place, as ``ReferenceAdam.move`` does.
+
+    Returns [] bool: no gradient is larger than MOST; else the table is of no use.
+    """
+    is_well = torch.ones((), dtype=torch.bool, device=value.device)
     if not value.numel():
-        return
+        return is_well
     size, width, is_table = value.numel(), value.numel() // len(value), isinstance(lr, torch.Tensor)
     rates = lr.expand(len(value), width) if isinstance(lr, torch.Tensor) else value
     _move[(triton.cdiv(size, BLOCK),)](
@@ -77,7 +90,9 @@ def move_table(
         steps=steps,
         corrections=corrections,
         rates=rates,
+        is_well=is_well.view(torch.uint8),
         rate=0.0 if is_table else lr,
+        limit=MOST,
         size=size,
         width=width,
         by_row=rates.stride(0),
@@ -88,3 +103,4 @@ def move_table(
         as_table=is_table,
         block=BLOCK,
     )
+    return is_well

@@ -145,6 +145,9 @@ class FusedAdam(ReplayedAdam):
         super().__init__(recorder)
         self._fused = fused
 
+    def looks(self, value: torch.Tensor) -> bool:
+        return self._fused.serves(value)
+
     def move(
         self,
         value: torch.Tensor,
@@ -152,12 +155,12 @@ class FusedAdam(ReplayedAdam):
         state: AdamState,
         corrections: torch.Tensor,
         lr: float | torch.Tensor,
-    ) -> None:
+    ) -> torch.Tensor | None:
         if not self._fused.serves(value):
-            super().move(value, gradient, state, corrections, lr=lr)
-            return
+            return super().move(value, gradient, state, corrections, lr=lr)
         moments = (state.exp_avg, state.exp_avg_sq, state.steps)
-        self._fused.move_table(value, gradient, *moments, corrections, lr)
+        is_well: torch.Tensor = self._fused.move_table(value, gradient, *moments, corrections, lr)
+        return is_well
 
     def add_rate(
         self,

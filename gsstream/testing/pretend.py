@@ -290,14 +290,16 @@ class _Kernel(torch.autograd.Function):
             out = function(*inner[:cut], **dict(zip(names, inner[cut:], strict=True)))
         ctx.inner, ctx.out = inner, out if isinstance(out, tuple) else (out,)
         found = tuple(PretendTensor(x.detach()) if isinstance(x, torch.Tensor) else x for x in ctx.out)
+        # Not the tensors themselves: whoever holds a gradient, too, makes autograd copy it.
+        places = [made.memory if isinstance(made, PretendTensor) else None for made in found]
 
         def again() -> None:
             with torch.enable_grad():
                 out = function(*inner[:cut], **dict(zip(names, inner[cut:], strict=True)))
             ctx.out = out if isinstance(out, tuple) else (out,)
-            for made, x in zip(found, ctx.out, strict=True):
-                if isinstance(made, PretendTensor):
-                    made.memory.copy_(x.detach())
+            for place, x in zip(places, ctx.out, strict=True):
+                if place is not None:
+                    place.copy_(x.detach())
 
         if _TAPE is not None:
             _TAPE.append(again)

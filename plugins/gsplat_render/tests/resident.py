@@ -11,7 +11,7 @@ from gsstream_gsplat_render.fused import Fused, FusedAdam, FusedLoss
 from gsstream_gsplat_render.kernels import Kernels
 from gsstream_gsplat_render.rig import Rigs
 from gsstream_gsplat_render.session import GsplatSession
-from gsstream_gsplat_render.tiles import IN_TORCH, TileKernels
+from gsstream_gsplat_render.tiles import IN_TORCH, RowKernels, TileKernels
 from torch_kernels import TORCH_FUSED, TORCH_KERNELS
 
 from gsstream.backend import Loss, RowOptimiser
@@ -23,9 +23,15 @@ from gsstream.testing.pretend import DEVICE, PretendRecorder, kernel
 
 ON_DEVICE = Kernels(*(kernel(getattr(TORCH_KERNELS, field.name)) for field in fields(Kernels)))
 TILES_THERE = TileKernels(*(kernel(getattr(IN_TORCH, field.name)) for field in fields(TileKernels)))
+ROWS_THERE = RowKernels(*(kernel(getattr(TORCH_FUSED.rows, field.name)) for field in fields(RowKernels)))
 FUSED_THERE = Fused(
     DEVICE.type,
-    *(kernel(getattr(TORCH_FUSED, field.name)) for field in fields(Fused) if field.name not in ("device", "tiles")),
+    *(
+        kernel(getattr(TORCH_FUSED, field.name))
+        for field in fields(Fused)
+        if field.name not in ("device", "rows", "tiles")
+    ),
+    rows=ROWS_THERE,
     tiles=TILES_THERE,
 )
 CPU = torch.device("cpu")
@@ -36,7 +42,7 @@ SAME_BITS = pytest.mark.skipif(
 )
 
 
-RIGS = {"cpu": Rigs(CPU), "pretend": Rigs(DEVICE, PretendRecorder(), TILES_THERE)}
+RIGS = {"cpu": Rigs(CPU), "pretend": Rigs(DEVICE, PretendRecorder(), TILES_THERE, ROWS_THERE)}
 
 
 class StandIn(Renderer):

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from gsstream_gsplat_render import adam, boxes, gates, loss, rate
+from gsstream_gsplat_render import adam, boxes, gates, loss, rate, rows
 from gsstream_gsplat_render.fused import FusedAdam, FusedLoss, load_fused
 from torch_kernels import TORCH_FUSED
 
@@ -179,6 +179,26 @@ def test_gates_and_their_gradients_are_those_of_the_closed_forms(rows: int, node
         assert torch.allclose(by_position, want_position, rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.parametrize("higher", [0, 3, 15])
+def test_rows_go_into_the_tables_of_a_scene_and_out_of_them(higher: int) -> None:
+    g = torch.Generator().manual_seed(higher)
+    sizes = (3,), (4,), (3,), (), (1, 3), (higher, 3)
+    whole = [torch.randn(200, *size, generator=g).to(DEVICE) for size in sizes]
+    for count in (0, 1, 70, 200):
+        index = torch.randperm(200, generator=g)[:count].sort().values.to(DEVICE)
+        rows = [torch.randn(count, *size, generator=g).to(DEVICE) for size in sizes]
+        wanted = [table.index_copy(0, index, value) for table, value in zip(whole, rows, strict=True)]
+        found = [table.clone() for table in whole]
+        FUSED.rows.put(index, *rows, *found)
+        for table, want, value, taken in zip(found, wanted, rows, FUSED.rows.take(index, *found), strict=True):
+            assert torch.equal(table, want)
+            assert torch.equal(taken, value)
+    # A gradient may come in any order of memory.
+    turned = [table.transpose(0, -1).contiguous().transpose(0, -1) if table.dim() > 1 else table for table in whole]
+    for taken, table in zip(FUSED.rows.take(index, *turned), whole, strict=True):
+        assert torch.equal(taken, table[index])
+
+
 def test_where_triton_cannot_compile_the_reference_is_used_with_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*_: Any) -> Any:
         raise RuntimeError("Python.h: No such file or directory")
@@ -215,7 +235,7 @@ def test_the_contract_of_a_loss_and_of_an_optimiser(check: Any) -> None:
     check(Brings())
 
 
-@pytest.mark.parametrize("module", [adam, boxes, gates, rate], ids=lambda module: module.__name__.split(".")[-1])
+@pytest.mark.parametrize("module", [adam, boxes, gates, rate, rows], ids=lambda module: module.__name__.split(".")[-1])
 def test_no_kernel_is_compiled_anew_for_another_number_of_rows(module: Any) -> None:
     """Triton compiles once more where a number becomes 1 or divisible by 16, unless it is told not to."""
     by_rows = {"size", "count", "parts", "last", "halvings"}
@@ -232,14 +252,15 @@ import sys
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from gsstream_gsplat_render import adam, boxes, gates, loss, rate
+from gsstream_gsplat_render import adam, boxes, gates, loss, rate, rows
 
 KINDS = {"target": "*u8", "tiles": "*u8", "steps": "*i32", "visible": "*u8", "table": "*u8", "is_well": "*u8"}
 KINDS |= {"places": "*i16"}
-KINDS |= dict.fromkeys("near ends most active node_of".split(), "*i64")
+KINDS |= dict.fromkeys("near ends most active node_of index".split(), "*i64")
 KINDS |= dict.fromkeys("radii boxes areas owners".split(), "*i32")
 POINTERS = "image weights sums grads out values gradients first second corrections rates".split()
 POINTERS += "means scales latents gates logits opened slopes by_gate position by_logit by_position".split()
+POINTERS += "quats opacities sh0 shN all_means all_quats all_scales all_opacities all_sh0 all_shN".split()
 NUMBERS = "limit dssim scale rate slow slower weight least ln2 temperature offset levels".split()
 NUMBERS += "open_logit open_weight displacement_weight".split()
 
@@ -254,6 +275,7 @@ found += [compiled(kernel, as_bytes=True, all_tiles=False) for kernel in (loss._
 found += [compiled(boxes._find, side=16, block=256), compiled(boxes._cover, wide=32)]
 found += [compiled(rate._sum, rows=256, wide=16), compiled(rate._price, as_tensor=True, rows=256, wide=16)]
 found += [compiled(kernel, block=256) for kernel in (boxes._count, boxes._list, gates._open, gates._pull)]
+found += [compiled(rows._exchange, higher=9, wide=16, into=into, block=64) for into in (True, False)]
 assert all(code[:4] == b"\\x7fELF" for code in found)
 print(len(found))
 """
@@ -267,4 +289,4 @@ def test_the_kernels_compile_for_a_gpu_that_is_not_here(architecture: str, tmp_p
         [sys.executable, "-W", "ignore", "-c", COMPILE, architecture], env=environment, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split()[-1] == "11"
+    assert done.stdout.split()[-1] == "13"

@@ -19,13 +19,13 @@ import torch
 from gsstream.api import AnalyticGate, AnalyticPenalty, ShapeError
 from gsstream.backend import AdamState, Loss
 from gsstream.replay import Recorder, ReplayedAdam
-from gsstream_gsplat_render.tiles import Grid, TileKernels, tile_lists
+from gsstream_gsplat_render.tiles import Grid, RowKernels, TileKernels, tile_lists
 
 
 @dataclass(frozen=True, slots=True)
 class Fused:
-    """Functions of one launch each, with the signatures of ``loss.py``, ``adam.py``, ``rate.py``, ``gates.py`` and
-    ``tiles.py``.
+    """Functions of one launch each, with the signatures of ``loss.py``, ``adam.py``, ``rate.py``, ``gates.py``,
+    ``rows.py`` and ``tiles.py``.
 
     ``device``: the type of the device that they run on. What lies elsewhere is computed as the reference does it.
     """
@@ -38,6 +38,7 @@ class Fused:
     add_rate: Callable[..., Any]
     open_gates: Callable[..., Any]
     gate_gradients: Callable[..., Any]
+    rows: RowKernels
     tiles: TileKernels
 
     def serves(self, tensor: torch.Tensor) -> bool:
@@ -58,6 +59,7 @@ def load_fused(device: str) -> Fused | None:
     from gsstream_gsplat_render.gates import gate_gradients, open_gates
     from gsstream_gsplat_render.loss import gradient_by_pixel, loss_by_tile
     from gsstream_gsplat_render.rate import add_rate, sum_symbols
+    from gsstream_gsplat_render.rows import put_rows, take_rows
 
     image, mask = torch.zeros(16, 16, 3, device=device), torch.ones(1, 1, dtype=torch.bool, device=device)
     steps, corrections = torch.ones(1, dtype=torch.int32, device=device), torch.ones(2, 2, device=device)
@@ -72,6 +74,8 @@ def load_fused(device: str) -> Fused | None:
         rows = torch.zeros(2, dtype=torch.int64, device=device)
         opened, slopes = open_gates(image[7, 0], rows, 1.0, 0.0, 1)
         gate_gradients(opened, slopes, image[8, :2], image[7, 0], rows, 0.0, 1.0, 1.0)
+        tables = [torch.zeros(2, *size, device=device) for size in ((3,), (4,), (3,), (), (1, 3), (3, 3))]
+        put_rows(rows[:1], *take_rows(rows[:1], *tables), *tables)
         lists = TileKernels(boxes.find_boxes, boxes.count_entries, boxes.list_entries, boxes.cover_tiles)
         _try_tiles(lists, torch.device(device))
     except Exception as error:  # compilers and drivers of strangers fail in any way
@@ -91,6 +95,7 @@ def load_fused(device: str) -> Fused | None:
         add_rate=add_rate,
         open_gates=open_gates,
         gate_gradients=gate_gradients,
+        rows=RowKernels(put_rows, take_rows),
         tiles=lists,
     )
 

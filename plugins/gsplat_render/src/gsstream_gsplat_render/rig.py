@@ -11,7 +11,7 @@ import torch
 from gsstream.api import Cameras
 from gsstream.replay import Recorder, Records, recorder_on
 from gsstream_gsplat_render.fused import load_fused
-from gsstream_gsplat_render.tiles import IN_TORCH, TILE, Grid, TileKernels
+from gsstream_gsplat_render.tiles import IN_TORCH, TILE, Grid, RowKernels, TileKernels
 
 Background = tuple[float, float, float]
 #: Entries of the lists of tiles: room beyond what was seen, and the unit in which lists grow.
@@ -133,11 +133,18 @@ class Rig:
 class Rigs:
     """The rigs that were drawn last on a device, so that one that is drawn again is not copied again.
 
-    ``recorder``: of the device; None: nothing is recorded there. ``kernels``: that sort into tiles.
+    ``recorder``: of the device; None: nothing is recorded there. ``kernels``: that sort into tiles. ``rows``: that put
+    rows into a scene; None: torch does.
     """
 
-    def __init__(self, device: torch.device, recorder: Recorder | None = None, kernels: TileKernels = IN_TORCH) -> None:
-        self.device, self.recorder, self.kernels = device, recorder, kernels
+    def __init__(
+        self,
+        device: torch.device,
+        recorder: Recorder | None = None,
+        kernels: TileKernels = IN_TORCH,
+        rows: RowKernels | None = None,
+    ) -> None:
+        self.device, self.recorder, self.kernels, self.rows = device, recorder, kernels, rows
         self._last: list[Rig] = []
 
     def find(self, cameras: Cameras, background: Background) -> Rig:
@@ -161,4 +168,6 @@ def rigs_on(device: str) -> Rigs:
     """Return the rigs of a device; all renderers that work on it share them."""
     place = torch.empty(0, device=device).device  # with its number, as tensors that lie there have it
     fused = load_fused(device)
-    return Rigs(place, recorder_on(place), IN_TORCH if fused is None else fused.tiles)
+    if fused is None:
+        return Rigs(place, recorder_on(place))
+    return Rigs(place, recorder_on(place), fused.tiles, fused.rows)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from copy import copy
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import torch
 
@@ -18,6 +18,7 @@ from gsstream_gsplat_render.seen import Projected
 from gsstream_gsplat_render.splat import (
     Drawn,
     Pasted,
+    Placed,
     composite,
     composite_fixed,
     draw,
@@ -92,8 +93,9 @@ class GsplatSession(ReplayedSession):
         #: Of each view the image, its alpha, and the boxes of the Gaussians.
         self._pictures: dict[int, tuple[torch.Tensor, ...]] = {}
         self._tiles: dict[int, torch.Tensor] = {}
-        #: Of what the active rows make.
+        #: Of what the active rows make, and the tables of the scene that these rows are put into meanwhile.
         self._records: Records | None = None
+        self._tables: tuple[torch.Tensor, ...] | None = None
         if active is not None:
             self.narrow(active)
 
@@ -161,7 +163,7 @@ class GsplatSession(ReplayedSession):
     def narrow(self, active: torch.Tensor) -> None:
         self._active = active.to(self._rigs.device)
         # The pictures stay, which show the scene as it is; the tiles are those of other rows.
-        self._tiles, self._records = {}, None
+        self._tiles, self._records, self._tables = {}, None, None
 
     def commit(self, gaussians: Gaussians[torch.Tensor], changed: torch.Tensor) -> RenderSession:
         return GsplatSession(
@@ -212,6 +214,7 @@ class GsplatSession(ReplayedSession):
             return rig.records if rig.is_measured else None
         if self._records is None:
             self._records = Records(rig.recorder, room=rig)
+            self._tables = tuple(value.clone() for _, value in self._scene.items())
         return self._records
 
     def own(self, view: int) -> Own:
@@ -249,6 +252,11 @@ class GsplatSession(ReplayedSession):
         if self._active is None:
             return rows, moved
         base, active = dict(self._scene.items()), self._active
+        if self.fixed is not None and self._tables is not None and self._rigs.rows is not None:
+            values = [getattr(rows, name) for name in base]
+            placed: Any = Placed.apply(self._rigs.rows, active, self._tables, *values)  # type: ignore[no-untyped-call]
+            whole = Gaussians(**dict(zip(base, placed, strict=True)))
+            return whole, None if moved is None else moved.new_zeros(len(whole), 2).index_copy(0, active, moved)
         whole = Gaussians(**{name: base[name].index_copy(0, active, value) for name, value in rows.items()})
         if moved is None:
             return whole, None

@@ -12,7 +12,7 @@ from gsstream.api import Gaussians
 from gsstream_gsplat_render.kernels import Kernels
 from gsstream_gsplat_render.rig import Target
 from gsstream_gsplat_render.seen import Projected
-from gsstream_gsplat_render.tiles import TILE, Grid, tile_lists
+from gsstream_gsplat_render.tiles import TILE, Grid, RowKernels, tile_lists
 
 BLUR = 0.3  # px^2, added to the 2-D covariance: what gsplat calls eps2d
 FAR = 1e10
@@ -221,6 +221,29 @@ def pixels(mask: torch.Tensor, view: Target) -> torch.Tensor:
     rows, columns = mask.shape
     wide = mask[:, None, :, None].expand(rows, TILE, columns, TILE).reshape(rows * TILE, columns * TILE)
     return wide[: view.height, : view.width]
+
+
+class Placed(torch.autograd.Function):
+    """The six tables of a scene with other rows ``index`` [A], which are put into the very tables.
+
+    Only the rows have a gradient. It is that of one use of the tables: the next puts other rows into them.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, kernels: RowKernels, index: torch.Tensor, whole: tuple[torch.Tensor, ...], *rows: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        kernels.put(index, *rows, *whole)
+        ctx.set_materialize_grads(False)
+        ctx.kernels, ctx.index, ctx.whole = kernels, index, whole
+        return tuple(table.view_as(table) for table in whole)
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Any) -> Any:
+        # Of a table that has no gradient anything may be taken: nobody looks at it.
+        given = [table if grad is None else grad for grad, table in zip(upstream, ctx.whole, strict=True)]
+        taken = ctx.kernels.take(ctx.index, *given)
+        return None, None, None, *(None if grad is None else rows for grad, rows in zip(upstream, taken, strict=True))
 
 
 class Pasted(torch.autograd.Function):

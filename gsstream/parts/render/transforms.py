@@ -52,6 +52,16 @@ def _quadratic_forms(device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
     return 0.5 * (both - one - other), quat_multiply_torch(first, second)
 
 
+@functools.cache
+def _turned(device: torch.device) -> torch.Tensor:
+    """[16, 3]: what makes of the products of a gradient by a quaternion and that quaternion the gradient by a small turn.
+
+    A small turn v in front of a quaternion q adds (0, v) q to it. Kept.
+    """
+    units = torch.eye(4, dtype=torch.float64, device=device)
+    return torch.stack([quat_multiply_torch(v.expand(4, 4), units).T.flatten() for v in units[1:]], 1)
+
+
 def _of_unit_norm(quats: torch.Tensor) -> torch.Tensor:
     """[n, 9]: the quadratic form that is the rotation matrix of a quaternion of norm 1, of quaternions of any norm."""
     return rotation_matrices(quats).reshape(-1, 9) * quats.square().sum(1, keepdim=True)
@@ -66,12 +76,7 @@ def transform_vjp(leaves: Gaussians[torch.Tensor], transforms: GroupTransforms[t
     arm = leaves.means.detach().double() - (transforms.center + transforms.translation)[transforms.group]
     torque = 2 * _cross(arm, force)
     if leaves.quats.grad is not None:
-        w, x, y, z = leaves.quats.detach().double().unbind(1)
-        a, b, c, d = leaves.quats.grad.double().unbind(1)
-        # A small turn v in front of a quaternion q adds (0, v) q to it.
-        torque += torch.stack(
-            [-a * x + b * w - c * z + d * y, -a * y + b * z + c * w - d * x, -a * z - b * y + c * x + d * w], 1
-        )
+        torque += _products(leaves.quats.grad.double(), leaves.quats.detach().double()) @ _turned(out.device)
     return out.index_add_(0, transforms.group, torch.cat([force, torque], 1))
 
 

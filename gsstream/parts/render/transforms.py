@@ -54,7 +54,7 @@ def _quadratic_forms(device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
 
 @functools.cache
 def _turned(device: torch.device) -> torch.Tensor:
-    """[16, 3]: what makes of the products of a gradient by a quaternion and that quaternion the gradient by a small turn.
+    """[16, 3]: what makes of the products of a quaternion's gradient and the quaternion the gradient by a small turn.
 
     A small turn v in front of a quaternion q adds (0, v) q to it. Kept.
     """

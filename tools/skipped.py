@@ -2,8 +2,8 @@
 
     python -m tools.skipped SOURCE [KEY=VALUE ...] [--method s2gs-edge] [--frames 25] [--every 1 2 4] [--name NAME]
 
-Frame 0 is made once. Then the recording is encoded for each n, every frame between two that are encoded being skipped, as a
-live run that is behind does (``watch:...?behind=drop``). Prints a JSON object a line: means over the frames that are
+Frame 0 is made once. Then the recording is encoded for each n, and frames between two that are encoded are skipped, as
+a live run that is behind does (``watch:...?behind=drop``). Prints a JSON object a line: means over the frames that are
 encoded and all test cameras. *Changed* pixels differ from the picture that the test camera showed when the last frame
 was encoded.
 """

@@ -247,6 +247,22 @@ def test_going_on_after_a_frame_equals_never_having_stopped(tmp_path: Path, case
         assert packets(sent) == packets(whole(case))[last + 1 :], f"resumed after frame {last}"
 
 
+@pytest.mark.parametrize("case", ["rigid", "keys"])
+def test_going_on_among_skipped_frames_equals_never_having_stopped(tmp_path: Path, case: str) -> None:
+    """What moved is looked for where it was heading, which a resumed encoder knows from the packets."""
+    given = [replace(frame, epoch_scale=effort) for frame, effort in zip(frames(), (1, 1, 0, 1, 0, 1), strict=True)]
+    made = encoder(case)
+    unbroken = tuple(made.encode(frame) for frame in given)
+    heading = [step.state.player.scene.heading is not None for step in unbroken]
+    assert case == "keys" or all(heading[2:4]), "nothing moved: the case asks for a body on its way"
+    stream = write(tmp_path / "stream.gss", unbroken)
+    for last in range(5):
+        made = encoder(case)
+        assert made.resume(stream, lambda index: given[index], last) == last
+        sent = [made.encode(frame) for frame in given[last + 1 :]]
+        assert packets(sent) == packets(unbroken)[last + 1 :], f"resumed after frame {last}"
+
+
 def test_going_on_asks_for_the_frame_that_the_scene_shows(tmp_path: Path) -> None:
     stream, asked = write(tmp_path / "stream.gss", whole("keys")), list[int]()
 

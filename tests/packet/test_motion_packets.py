@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -28,6 +29,7 @@ from packet_scenes import (
 
 from gsstream.core.changes import (
     Delta,
+    Displacement,
     Layout,
     Motion,
     Residual,
@@ -371,6 +373,16 @@ def test_what_moves_steadily_is_heading_where_it_goes_whatever_was_skipped(seed:
         ahead = state.scene.heading if empty else state.scene.displacement
         np.testing.assert_allclose(ahead.translation, np.tile(way, (6, 1)), atol=1e-5)
         assert (state.empty, state.scene.heading is None) == (0, empty == 0)
+
+
+def test_an_empty_packet_after_a_hostile_motion_is_decoded_without_a_warning() -> None:
+    state = decode_packet(None, encode_key(make_key(np.random.default_rng(0), 6, 2)).data)
+    far = np.full((6, 3), 2e38, np.float32)
+    state = replace(state, scene=replace(state.scene, displacement=Displacement(np.arange(6), far, far)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        after = decode_packet(state, encode_empty(frame=1).data)
+    assert np.isinf(after.scene.heading.translation).all()
 
 
 def every_group(scene: Scene, correction: np.ndarray) -> Motion:

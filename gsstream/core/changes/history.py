@@ -32,7 +32,8 @@ class Displacement:
 
     def times(self, share: float) -> Displacement:
         """Return what goes so much farther, as far as small turns add up."""
-        return Displacement(self.rows, self.translation * np.float32(share), self.rotation * np.float32(share))
+        with np.errstate(over="ignore"):  # of a hostile stream, which nobody goes on encoding
+            return Displacement(self.rows, self.translation * np.float32(share), self.rotation * np.float32(share))
 
 
 def displacement_between(

@@ -9,9 +9,10 @@ import pytest
 import torch
 from gsstream_gsplat_render.fused import Fused, FusedAdam, FusedLoss
 from gsstream_gsplat_render.kernels import Kernels
+from gsstream_gsplat_render.placed import RowKernels
 from gsstream_gsplat_render.rig import Rigs
 from gsstream_gsplat_render.session import GsplatSession
-from gsstream_gsplat_render.tiles import IN_TORCH, RowKernels, TileKernels
+from gsstream_gsplat_render.tiles import IN_TORCH, TileKernels
 from torch_kernels import TORCH_FUSED, TORCH_KERNELS
 
 from gsstream.backend import Loss, RowOptimiser

@@ -13,7 +13,8 @@ import torch
 from gsplat.cuda import _torch_impl as gsplat
 from gsstream_gsplat_render.fused import Fused
 from gsstream_gsplat_render.kernels import Kernels
-from gsstream_gsplat_render.tiles import IN_TORCH, RowKernels
+from gsstream_gsplat_render.placed import ROWS_IN_TORCH
+from gsstream_gsplat_render.tiles import IN_TORCH
 
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.parts.backend.adam import ReferenceAdam
@@ -285,15 +286,6 @@ def gate_gradients(
     return by_images + by_probability * slope, by_position
 
 
-def put_rows(index: torch.Tensor, *tables: torch.Tensor) -> None:
-    for rows, whole in zip(tables[:6], tables[6:], strict=True):
-        whole.index_copy_(0, index, rows)
-
-
-def take_rows(index: torch.Tensor, *whole: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    return tuple(table.index_select(0, index) for table in whole)
-
-
 TORCH_FUSED = Fused(
     "cpu",
     loss_by_tile,
@@ -303,6 +295,6 @@ TORCH_FUSED = Fused(
     add_rate,
     open_gates,
     gate_gradients,
-    rows=RowKernels(put_rows, take_rows),
+    rows=ROWS_IN_TORCH,
     tiles=IN_TORCH,
 )

@@ -19,7 +19,8 @@ import torch
 from gsstream.api import AnalyticGate, AnalyticPenalty, ShapeError
 from gsstream.backend import AdamState, Loss
 from gsstream.replay import Recorder, ReplayedAdam
-from gsstream_gsplat_render.tiles import Grid, RowKernels, TileKernels, tile_lists
+from gsstream_gsplat_render.placed import RowKernels
+from gsstream_gsplat_render.tiles import Grid, TileKernels, tile_lists
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,15 +205,13 @@ class FusedGates:
     def __init__(
         self, gates: Any, form: AnalyticGate, penalty: AnalyticPenalty, *, fused: Fused, optimiser: FusedAdam
     ) -> None:
-        self._gates, self._form, self._penalty = gates, form, penalty
-        self._fused, self._optimiser = fused, optimiser
+        self._form, self._penalty, self._fused, self._optimiser = form, penalty, fused, optimiser
         self.gate, self.regularizer = gates.gate, gates.regularizer
         self.logits, self.state, self.lr = gates.logits, gates.state, gates.lr
         self.node_of, self.num_gaussians = gates.node_of, gates.num_gaussians
 
     def noise(self) -> torch.Tensor | None:
-        noise: torch.Tensor | None = self._gates.noise()
-        return noise
+        return None  # a closed form has none
 
     def sample(self, noise: torch.Tensor | None, frozen: torch.Tensor | None) -> torch.Tensor:
         if noise is not None or frozen is not None:

@@ -11,7 +11,8 @@ import torch
 from gsstream.api import Cameras
 from gsstream.replay import Recorder, Records, recorder_on
 from gsstream_gsplat_render.fused import load_fused
-from gsstream_gsplat_render.tiles import IN_TORCH, TILE, Grid, RowKernels, TileKernels
+from gsstream_gsplat_render.placed import ROWS_IN_TORCH, RowKernels
+from gsstream_gsplat_render.tiles import IN_TORCH, TILE, Grid, TileKernels
 
 Background = tuple[float, float, float]
 #: Entries of the lists of tiles: room beyond what was seen, and the unit in which lists grow.
@@ -134,7 +135,7 @@ class Rigs:
     """The rigs that were drawn last on a device, so that one that is drawn again is not copied again.
 
     ``recorder``: of the device; None: nothing is recorded there. ``kernels``: that sort into tiles. ``rows``: that put
-    rows into a scene; None: torch does.
+    rows into a scene.
     """
 
     def __init__(
@@ -142,7 +143,7 @@ class Rigs:
         device: torch.device,
         recorder: Recorder | None = None,
         kernels: TileKernels = IN_TORCH,
-        rows: RowKernels | None = None,
+        rows: RowKernels = ROWS_IN_TORCH,
     ) -> None:
         self.device, self.recorder, self.kernels, self.rows = device, recorder, kernels, rows
         self._last: list[Rig] = []

@@ -1,4 +1,4 @@
-"""Some rows of all six tables of a scene, put into the scene and taken out of it, in one launch each, in Triton."""
+"""The functions of ``placed.py`` as kernels in Triton, one launch each for all six tables of a scene."""
 
 # Arguments of a kernel are what Triton makes of them: pointers and values of a program.
 # mypy: disable-error-code="no-untyped-def, untyped-decorator"
@@ -65,17 +65,12 @@ def _exchange(
 
 
 def put_rows(index: torch.Tensor, *tables: torch.Tensor) -> None:
-    """Put rows into a scene, in place.
-
-    Arguments:
-        index: [A] int64, no duplicates.
-        tables: rows [A, ...] of means, quats, scales, opacities, sh0 and shN, then those six tables [N, ...]; float32.
-    """
+    """Do what ``placed.put_rows`` does."""
     _launch(index, tables, into=True)
 
 
 def take_rows(index: torch.Tensor, *whole: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Return the rows ``index`` [A] int64 of the six tables [N, ...] of a scene, float32."""
+    """Return what ``placed.take_rows`` does."""
     given = [table.contiguous() for table in whole]
     rows = tuple(table.new_empty(len(index), *table.shape[1:]) for table in given)
     _launch(index, (*rows, *given), into=False)

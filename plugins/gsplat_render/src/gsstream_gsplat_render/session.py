@@ -13,15 +13,15 @@ from gsstream.api import Cameras, Gaussians, ShapeError
 from gsstream.backend import RenderOutput, RenderSession, ScreenGradient, check_tiles
 from gsstream.replay import RecordError, Records, ReplayedSession, SeenView
 from gsstream_gsplat_render.kernels import Kernels
+from gsstream_gsplat_render.placed import Placed
 from gsstream_gsplat_render.rig import Background, Rig, Rigs, Target
 from gsstream_gsplat_render.seen import Projected
 from gsstream_gsplat_render.splat import (
     Drawn,
     Pasted,
-    Placed,
     composite,
     composite_fixed,
-    draw,
+    draw_nothing,
     draw_views,
     pixels,
     project,
@@ -115,7 +115,7 @@ class GsplatSession(ReplayedSession):
         whole, whole_probe = self._merged(_moved(rows, self._rigs.device), probe)
         mask = None if tile_mask is None else grid.padded(_checked_mask(tile_mask, target).to(self._rigs.device))
         if len(whole) == 0:
-            drawn = draw(self._kernels, whole, target, grid)
+            drawn = draw_nothing(target)
             return RenderOutput(drawn.image.to(home), drawn.alpha.to(home))
         seen = project(self._kernels, whole, target, grid, probe=whole_probe)
         if shown is None:
@@ -252,15 +252,13 @@ class GsplatSession(ReplayedSession):
         if self._active is None:
             return rows, moved
         base, active = dict(self._scene.items()), self._active
-        if self.fixed is not None and self._tables is not None and self._rigs.rows is not None:
+        if self.fixed is not None and self._tables is not None:
             values = [getattr(rows, name) for name in base]
             placed: Any = Placed.apply(self._rigs.rows, active, self._tables, *values)  # type: ignore[no-untyped-call]
             whole = Gaussians(**dict(zip(base, placed, strict=True)))
-            return whole, None if moved is None else moved.new_zeros(len(whole), 2).index_copy(0, active, moved)
-        whole = Gaussians(**{name: base[name].index_copy(0, active, value) for name, value in rows.items()})
-        if moved is None:
-            return whole, None
-        return whole, moved.new_zeros(len(whole), 2).index_copy(0, active, moved)
+        else:
+            whole = Gaussians(**{name: base[name].index_copy(0, active, value) for name, value in rows.items()})
+        return whole, None if moved is None else moved.new_zeros(len(whole), 2).index_copy(0, active, moved)
 
     def _shown_before(self, view: int) -> Shown:
         """The view of the session's scene, and the tiles in which the active rows are drawn in it."""

@@ -12,7 +12,7 @@ from gsstream.api import Gaussians
 from gsstream_gsplat_render.kernels import Kernels
 from gsstream_gsplat_render.rig import Target
 from gsstream_gsplat_render.seen import Projected
-from gsstream_gsplat_render.tiles import TILE, Grid, RowKernels, tile_lists
+from gsstream_gsplat_render.tiles import TILE, Grid, tile_lists
 
 BLUR = 0.3  # px^2, added to the 2-D covariance: what gsplat calls eps2d
 FAR = 1e10
@@ -82,10 +82,9 @@ def composite(kernels: Kernels, seen: Projected, view: Target, mask: torch.Tenso
 
     The last row of the mask is not looked at.
     """
-    order, offsets = _sorted(kernels, seen.means2d[None], seen.radii[None], depths=seen.depths[None], views=view)
-    wanted = None if mask is None else mask[: len(offsets[0])]
-    image, alpha = _rasterized(kernels, seen, view, offsets=offsets.squeeze(0), order=order, mask=wanted)
-    return Drawn(image, alpha, entries=len(order))
+    lists = _sorted(kernels, seen.means2d[None], seen.radii[None], depths=seen.depths[None], views=view)
+    wanted = None if mask is None else mask[: view.tiles[0]]
+    return _one(kernels, seen, view, lists=lists, mask=wanted, entries=len(lists[0]))
 
 
 def composite_fixed(
@@ -96,34 +95,58 @@ def composite_fixed(
     The last row of the mask is False. Where the lists are too short, nothing is drawn, so no gradient is wrong, and the
     grid remembers it.
     """
-    lists, wanted = tile_lists(seen.depths, seen.boxes, grid), grid.inside if mask is None else mask
-    image, alpha = _rasterized(kernels, seen, view, offsets=lists.offsets, order=lists.order, mask=wanted)
-    return Drawn(image, alpha, entries=grid.capacity)
+    order, offsets = tile_lists(seen.depths, seen.boxes, grid)
+    wanted = grid.inside if mask is None else mask
+    return _one(kernels, seen, view, lists=(order, offsets[None]), mask=wanted, entries=grid.capacity)
 
 
 def _rasterized(
     kernels: Kernels,
-    seen: Projected,
     view: Target,
-    offsets: torch.Tensor,
-    order: torch.Tensor,
+    means2d: torch.Tensor,
+    conics: torch.Tensor,
+    colors: torch.Tensor,
+    opacities: torch.Tensor,
+    *,
+    lists: tuple[torch.Tensor, torch.Tensor],
+    background: torch.Tensor,
     mask: torch.Tensor | None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
+    """Images [V, H, W, channels] and alpha [V, H, W] of V views.
+
+    ``lists``: entries of the tiles, and [V, rows, columns] where those of each tile begin.
+    """
+    order, offsets = lists
     image, alpha = kernels.rasterize(
-        seen.means2d[None],
-        seen.conics[None],
-        seen.colors[None],
-        seen.opacities[None],
+        means2d,
+        conics,
+        colors,
+        opacities,
         view.width,
         view.height,
         TILE,
-        offsets[None],
+        offsets,
         order,
-        backgrounds=view.background,
-        masks=None if mask is None else mask[None],
+        backgrounds=background,
+        masks=mask,
         packed=False,
     )
-    return image.squeeze(0), alpha.squeeze((0, 3))
+    return image, alpha.squeeze(-1)
+
+
+def _one(
+    kernels: Kernels,
+    seen: Projected,
+    view: Target,
+    lists: tuple[torch.Tensor, torch.Tensor],
+    mask: torch.Tensor | None,
+    entries: int,
+) -> Drawn:
+    """The only view of a target."""
+    splats = seen.means2d[None], seen.conics[None], seen.colors[None], seen.opacities[None]
+    wanted = None if mask is None else mask[None]
+    image, alpha = _rasterized(kernels, view, *splats, lists=lists, background=view.background, mask=wanted)
+    return Drawn(image.squeeze(0), alpha.squeeze(0), entries)
 
 
 class Pictures(NamedTuple):
@@ -145,24 +168,12 @@ def draw_views(kernels: Kernels, gaussians: Gaussians[torch.Tensor], views: Targ
         radii, means2d, depths, conics = _projected(kernels, gaussians, views, opacities)
         boxes, visible = grid.boxes(means2d.flatten(0, 1), radii.flatten(0, 1))
         colors = _colors(kernels, gaussians, views, visible.view(radii.shape[:2]))
-        order, offsets = _sorted(kernels, means2d, radii, depths=depths, views=views)
-        image, alpha = kernels.rasterize(
-            means2d,
-            conics,
-            colors,
-            opacities.expand(len(colors), -1),
-            views.width,
-            views.height,
-            TILE,
-            offsets,
-            order,
-            backgrounds=views.background,
-            masks=None,
-            packed=False,
-        )
-        begins = [*offsets[:, 0, 0].cpu().tolist(), len(order)]
+        lists = _sorted(kernels, means2d, radii, depths=depths, views=views)
+        splats = means2d, conics, colors, opacities.expand(len(colors), -1)
+        image, alpha = _rasterized(kernels, views, *splats, lists=lists, background=views.background, mask=None)
+        begins = [*lists[1][:, 0, 0].cpu().tolist(), len(lists[0])]
     longest = max(end - begin for begin, end in pairwise(begins))
-    return Pictures(image, alpha.squeeze(-1), boxes.view(*radii.shape[:2], 4), longest)
+    return Pictures(image, alpha, boxes.view(*radii.shape[:2], 4), longest)
 
 
 def rows_in_tiles(
@@ -179,23 +190,11 @@ def rows_in_tiles(
     with torch.no_grad():
         opacities = gaussians.opacities.sigmoid()
         radii, means2d, depths, conics = _projected(kernels, gaussians, views, opacities)
-        order, offsets = _sorted(kernels, means2d, radii, depths=depths, views=views)
+        lists, dark = _sorted(kernels, means2d, radii, depths=depths, views=views), torch.zeros_like(views.background)
     brightness = means2d.new_ones(*radii.shape[:2], 1).requires_grad_()
     with torch.enable_grad():
-        image, _ = kernels.rasterize(
-            means2d,
-            conics,
-            brightness,
-            opacities.expand(len(means2d), -1),
-            views.width,
-            views.height,
-            TILE,
-            offsets,
-            order,
-            backgrounds=torch.zeros_like(views.background[:, :1]),
-            masks=tiles,
-            packed=False,
-        )
+        splats = means2d, conics, brightness, opacities.expand(len(means2d), -1)
+        image, _ = _rasterized(kernels, views, *splats, lists=lists, background=dark[:, :1], mask=tiles)
         (weights,) = torch.autograd.grad(image, brightness, torch.ones_like(image))
     return (weights > 0).flatten(2).any(2).any(0)
 
@@ -209,41 +208,11 @@ def _sorted(
     return order, kernels.offsets(keys, count, columns, rows).reshape(count, rows, columns)
 
 
-def draw(kernels: Kernels, gaussians: Gaussians[torch.Tensor], view: Target, grid: Grid) -> Drawn:
-    """Draw raw Gaussians [N] that are on the device already."""
-    if len(gaussians) == 0:
-        return _empty(view)
-    return composite(kernels, project(kernels, gaussians, view, grid), view)
-
-
 def pixels(mask: torch.Tensor, view: Target) -> torch.Tensor:
     """A tile mask [rows + 1, columns] as a pixel mask [H, W]."""
     rows, columns = mask.shape
     wide = mask[:, None, :, None].expand(rows, TILE, columns, TILE).reshape(rows * TILE, columns * TILE)
     return wide[: view.height, : view.width]
-
-
-class Placed(torch.autograd.Function):
-    """The six tables of a scene with other rows ``index`` [A], which are put into the very tables.
-
-    Only the rows have a gradient. It is that of one use of the tables: the next puts other rows into them.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any, kernels: RowKernels, index: torch.Tensor, whole: tuple[torch.Tensor, ...], *rows: torch.Tensor
-    ) -> tuple[torch.Tensor, ...]:
-        kernels.put(index, *rows, *whole)
-        ctx.set_materialize_grads(False)
-        ctx.kernels, ctx.index, ctx.whole = kernels, index, whole
-        return tuple(table.view_as(table) for table in whole)
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Any) -> Any:
-        # Of a table that has no gradient anything may be taken: nobody looks at it.
-        given = [table if grad is None else grad for grad, table in zip(upstream, ctx.whole, strict=True)]
-        taken = ctx.kernels.take(ctx.index, *given)
-        return None, None, None, *(None if grad is None else rows for grad, rows in zip(upstream, taken, strict=True))
 
 
 class Pasted(torch.autograd.Function):
@@ -272,6 +241,7 @@ def _colors(kernels: Kernels, gaussians: Gaussians[torch.Tensor], view: Target, 
     return torch.nn.functional.threshold(harmonics + 0.5, -torch.finfo(torch.float32).tiny, 0.0)
 
 
-def _empty(view: Target) -> Drawn:
+def draw_nothing(view: Target) -> Drawn:
+    """Draw a scene without a Gaussian."""
     image = view.background.expand(view.height * view.width, 3).reshape(view.height, view.width, 3).clone()
     return Drawn(image, torch.zeros_like(image[..., 0]), 0)

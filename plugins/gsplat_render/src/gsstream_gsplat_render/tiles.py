@@ -30,14 +30,6 @@ class TileKernels:
     cover_tiles: Callable[..., Any]
 
 
-@dataclass(frozen=True, slots=True)
-class RowKernels:
-    """Functions of some rows of all tables of a scene, with the signatures of ``rows.py``."""
-
-    put: Callable[..., Any]
-    take: Callable[..., Any]
-
-
 def find_boxes(
     means2d: torch.Tensor, radii: torch.Tensor, rows: int, columns: int
 ) -> tuple[torch.Tensor, torch.Tensor]:

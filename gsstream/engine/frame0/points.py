@@ -82,7 +82,5 @@ def _sweep(frame: Frame, settings: FirstFrame, tell: Tell, source: Source | None
     known = None
     if source is not None:
         known = read_depth_maps(source.info.depth_maps, small.cameras, source.info.world.scale)
-    sweep = SweepSettings(device=str(device))
-    return photo_consistent_seeds(
-        small.images, small.cameras, settings.max_points, known=known, settings=sweep, tell=tell
-    ).points
+    sweep, count = SweepSettings(device=device), settings.max_points
+    return photo_consistent_seeds(small.images, small.cameras, count, known=known, settings=sweep, tell=tell).points

@@ -23,6 +23,7 @@ from gsstream.input.seeds.geometry import depth_range, neighbour_views, pixel_ce
 from gsstream.input.seeds.window import window_mean
 from gsstream.input.seeds.workers import one_thread_each
 
+_CPU = torch.device("cpu")
 _GREY = np.array([0.299, 0.587, 0.114], np.float32)
 
 
@@ -38,7 +39,7 @@ class SweepSettings:
         unseen: cost of a hypothesis outside a neighbour's image; an uncorrelated match costs 0.5.
         step_penalty, jump_penalty: aggregation costs of a change by one plane and by more.
         workers: threads, each on a view of its own; 0: as many as ``one_thread_each`` makes.
-        device: where the costs of matching are computed, as torch names it.
+        device: where the costs of matching are computed.
     """
 
     planes: int = 128
@@ -49,7 +50,7 @@ class SweepSettings:
     step_penalty: float = 0.03
     jump_penalty: float = 1.0
     workers: int = 0
-    device: str = "cpu"
+    device: torch.device = _CPU
 
 
 def sweep_depths(images: FloatArray, cameras: Cameras, settings: SweepSettings, tell: Tell = silent) -> FloatArray:

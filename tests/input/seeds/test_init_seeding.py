@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -112,7 +113,7 @@ def test_dense_seeds_lie_on_the_true_surfaces(scene: SyntheticSource) -> None:
 def test_depths_are_those_of_the_processor_on_a_device_that_takes_no_tensor_of_another(scene: SyntheticSource) -> None:
     images, cameras = scene.frame(0).images[:4], scene.info.train.select([0, 1, 2, 3])
     few = dataclasses.replace(QUICK, planes=16)
-    there = sweep_depths(images, cameras, dataclasses.replace(few, device=NAME))
+    there = sweep_depths(images, cameras, dataclasses.replace(few, device=torch.device(NAME)))
     np.testing.assert_allclose(there, sweep_depths(images, cameras, few), rtol=1e-5)
 
 

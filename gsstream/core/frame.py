@@ -24,6 +24,7 @@ class Arrival:
     #: files are gone already.
     complete: float | None
     absent: tuple[str, ...] = ()  # training cameras whose image did not come
+    waiting: int = 0  # later frames that had come when this one's turn had
 
 
 @dataclass(frozen=True, slots=True)

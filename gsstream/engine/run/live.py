@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from statistics import median
 from typing import Any
 
-from gsstream.core.frame import Frame
+from gsstream.core.frame import Arrival, Frame
+from gsstream.input.recordings.base import Moment
 
 #: Policy -> its words in the summary and in the line of a frame.
 COUNTED: Mapping[str, str] = {
@@ -38,6 +39,16 @@ def live_metrics(frame: Frame, written: float) -> dict[str, Any] | None:
         "policy": _policy(frame),
         "epoch_scale": frame.epoch_scale,
         "absent": list(arrival.absent),
+        "waiting": arrival.waiting,
+    }
+
+
+def past_moments(lines: Iterable[Mapping[str, Any]]) -> dict[int, Moment]:
+    """Frame -> how it came in, of those frames of a live recording that have a line of ``metrics.jsonl``."""
+    live = {int(line["frame"]): line["live"] for line in lines if line.get("live") is not None}
+    return {
+        frame: Moment(entry["epoch_scale"], Arrival(None, tuple(entry["absent"]), entry.get("waiting", 0)))
+        for frame, entry in live.items()
     }
 
 

@@ -40,13 +40,13 @@ def read_metrics(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
 
 def last_written(path: Path) -> int:
     """Return the last frame up to which no line of ``metrics.jsonl`` is missing, -1 when that of frame 0 is."""
-    frames = {int(line["frame"]) for line in _written(path)}
+    frames = {int(line["frame"]) for line in written_lines(path)}
     return next(frame for frame in itertools.count() if frame not in frames) - 1
 
 
 def trim_metrics(path: Path, last: int) -> list[dict[str, Any]]:
     """Drop the lines of frames that the stream does not hold (a kill came between), and return those kept."""
-    kept = [line for line in _written(path) if int(line["frame"]) <= last]
+    kept = [line for line in written_lines(path) if int(line["frame"]) <= last]
     if path.exists():
         add_metrics(path, kept, [])
     return kept
@@ -77,6 +77,6 @@ def add_metrics(path: Path, kept: list[dict[str, Any]], lines: Iterable[dict[str
     write_whole(path, "".join(json.dumps(line) + "\n" for line in found))
 
 
-def _written(path: Path) -> list[dict[str, Any]]:
-    """The lines of a run that goes on; without a file, none has been written."""
+def written_lines(path: Path) -> list[dict[str, Any]]:
+    """Return the lines of a run that goes on; without a file, none has been written."""
     return [line for _, line in read_metrics(path)] if path.exists() else []

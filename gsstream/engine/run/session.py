@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +23,13 @@ from gsstream.engine.run.blank import BlankStart, start_numbers
 from gsstream.engine.run.displacement import displacement_pixels
 from gsstream.engine.run.encoder import Callbacks, EncodedFrame, Encoder
 from gsstream.engine.run.few_cameras import expectation, first_frame_summary
-from gsstream.engine.run.live import live_metrics
+from gsstream.engine.run.live import live_metrics, past_moments
 from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.run.measured_again import measure_again
-from gsstream.engine.run.metrics_log import add_metrics, append_metrics, last_written, trim_metrics
+from gsstream.engine.run.metrics_log import add_metrics, append_metrics, last_written, trim_metrics, written_lines
 from gsstream.engine.run.output import write_whole
 from gsstream.engine.run.progress import RunProgress
-from gsstream.input.recordings.base import Source, SourceInfo
+from gsstream.input.recordings.base import Moment, Source, SourceInfo
 from gsstream.input.recordings.origin import RECORDING, whole_uri
 from gsstream.input.recordings.prefetch import Prefetcher
 from gsstream.packet import EncodedPacket, PlayerState, StreamReader, StreamWriter
@@ -190,10 +191,13 @@ class _Run:
         wanted: int | None = last_written(log)
         if not planned and wanted == -1:
             wanted = None
-        last = self.encoder.resume(stream, lambda index: self.source.frame(index, "train"), wanted)
+        past = past_moments(written_lines(log))
+        last = self.encoder.resume(stream, partial(self._encoded, past), wanted)
         if wanted is not None:
             _warn_lost_lines(stream, -1 if last is None else last)
         kept = trim_metrics(log, -1 if last is None else last)
+        if last is not None:
+            self.source.go_on_at(last + 1, past)
         if self.encoder.controller is not None:
             self.encoder.controller.remember(kept)
         if last is None and wanted is not None:
@@ -201,6 +205,13 @@ class _Run:
         if last is not None and wanted is None:
             self._measure_again(kept, last)
         return last
+
+    def _encoded(self, past: Mapping[int, Moment], index: int) -> Frame:
+        """A frame that this run has encoded, as it came in then."""
+        self.source.go_on_at(index + 1, past)
+        frame = self.source.frame(index, "train")
+        came = past.get(index)
+        return frame if came is None else replace(frame, epoch_scale=came.epoch_scale, arrival=came.arrival)
 
     def _measure_again(self, kept: list[dict[str, Any]], last: int) -> None:
         """Write the lines that the packets up to ``last`` lack."""
@@ -256,7 +267,9 @@ def _timed(frames: Prefetcher, source: Source) -> Iterator[tuple[Frame, Frame, f
             return
         waited = time.perf_counter() - started
         if train.arrival is not None:
-            train = replace(train, epoch_scale=min(train.epoch_scale, source.epoch_scale(train.index)))
+            worth = min(train.epoch_scale, source.epoch_scale(train.index))
+            arrival = replace(train.arrival, waiting=source.waiting(train.index))
+            train = replace(train, epoch_scale=worth, arrival=arrival)
         yield train, test, waited
 
 

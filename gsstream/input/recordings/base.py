@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -131,6 +131,16 @@ class Source(ABC):
         """
         return 1.0
 
+    def waiting(self, index: int) -> int:
+        """Return how many later frames have come when a frame's turn has come; 0 for a recording that is not live."""
+        return 0
+
+    def go_on_at(self, index: int, past: Mapping[int, Moment]) -> None:  # noqa: B027  # most files say all there is
+        """Take frames before this one for done: another run has encoded them, and ``past`` says how they came in.
+
+        A recording that is still being written must neither wait for them nor count them as waiting.
+        """
+
     def interrupt(self) -> None:  # noqa: B027  # most recordings are never waited for
         """End all waits: frames that are not there yet raise EndOfRecording from now on."""
 
@@ -208,6 +218,14 @@ class Wrapped(Source):
     def epoch_scale(self, index: int) -> float:
         """Return what the inner source says that a frame is worth."""
         return self._source.epoch_scale(index)
+
+    def waiting(self, index: int) -> int:
+        """Return how many later frames the inner source has."""
+        return self._source.waiting(index)
+
+    def go_on_at(self, index: int, past: Mapping[int, Moment]) -> None:
+        """Tell the inner source which frames are done."""
+        self._source.go_on_at(index, past)
 
     def interrupt(self) -> None:
         """End the waits of the inner source."""

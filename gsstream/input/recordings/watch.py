@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 import warnings
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -110,6 +110,22 @@ class WatchSource(CameraSource):
         """Return what a frame is worth now that its turn has come: more may wait than when it was read ahead."""
         return 1.0 if index == 0 else min(self._plan(index).epoch_scale, self._effort(index))
 
+    def waiting(self, index: int) -> int:
+        """Return how many frames after this one have come of all training cameras."""
+        self._newest = max(self._newest, index)
+        last = float("inf") if self._declared is None else self._declared - 1
+        # What a camera that is gone does not send keeps no frame from having come.
+        names = self._train - self._gone or self._train
+        while self._newest < last and all(self._path(name, self._newest + 1).exists() for name in names):
+            self._newest += 1
+        return self._newest - index
+
+    def go_on_at(self, index: int, past: Mapping[int, Moment]) -> None:
+        """Plan the frames before this one as ``past`` has them, and those that it lacks by the files that are there."""
+        with self._planning:
+            for done in range(self._next, index):
+                self._plan_done(done, past.get(done, Moment()))
+
     def points(self, kind: PointKind = "recording") -> PointCloud | None:
         """Return points that were written beside cameras.json before the run began, or None."""
         path = self._folder / POINTS_FILE
@@ -141,14 +157,28 @@ class WatchSource(CameraSource):
         if index >= self._next:
             with self._planning:
                 while self._next <= index:
-                    plan = self._decide(self._next)
-                    if plan != _WHOLE:
-                        before = self._plans.get(self._next - 1)
-                        self._plans[self._next] = before if before == plan else plan
-                    if not plan.skipped:
-                        self._last |= dict.fromkeys(set(self._ids) - {name for name, _ in plan.held}, self._next)
-                    self._next += 1
+                    self._keep(self._decide(self._next))
         return self._plans.get(index, _WHOLE)
+
+    def _keep(self, plan: _Plan) -> None:
+        """Write down the plan of the next frame."""
+        if plan != _WHOLE:
+            before = self._plans.get(self._next - 1)
+            self._plans[self._next] = before if before == plan else plan
+        if not plan.skipped:
+            self._last |= dict.fromkeys(set(self._ids) - {name for name, _ in plan.held}, self._next)
+        self._next += 1
+
+    def _plan_done(self, index: int, came: Moment) -> None:
+        """Plan a frame that another run has encoded, without a wait."""
+        self._numbers.begin(index)
+        if not any(self._path(name, index).exists() for name in self._ids):
+            self._numbers.left_out(index, over=True)
+        lost = () if came.arrival is None else came.arrival.absent
+        skipped = came.epoch_scale == 0 and not lost
+        there = {name for name in self._ids if name not in lost and self._path(name, index).exists()}
+        held = [name for name in self._ids if (skipped or name not in there) and name in self._last]
+        self._keep(_Plan(came.epoch_scale, tuple((name, self._last[name]) for name in held), skipped=skipped))
 
     def _decide(self, index: int) -> _Plan:
         if self._info.num_frames is not None and index >= self._info.num_frames:
@@ -169,13 +199,7 @@ class WatchSource(CameraSource):
             return 1.0
         if index < self._skip_to:
             return 0.0
-        self._newest = max(self._newest, index)
-        last = float("inf") if self._declared is None else self._declared - 1
-        # What a camera that is gone does not send keeps no frame from having come.
-        names = self._train - self._gone or self._train
-        while self._newest < last and all(self._path(name, self._newest + 1).exists() for name in names):
-            self._newest += 1
-        waiting = self._newest - index
+        waiting = self.waiting(index)
         if waiting <= self._options.queue:
             return 1.0
         if self._options.behind == "hurry":

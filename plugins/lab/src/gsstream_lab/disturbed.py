@@ -12,6 +12,7 @@ A stream names the whole URI as its recording, so that evaluating and resuming s
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -145,6 +146,15 @@ class DisturbedSource(Wrapped):
     def epoch_scale(self, index: int) -> float:
         """Return what the inner source says that a frame is worth."""
         return self._source.epoch_scale(self._place(index))
+
+    def waiting(self, index: int) -> int:
+        """Return how many frames after the one that is shown the inner source has."""
+        return self._source.waiting(self._place(index))
+
+    def go_on_at(self, index: int, past: Mapping[int, Moment]) -> None:
+        """Tell the inner source which of its frames are done."""
+        shown = {self._place(done): past[done] for done in range(index) if done in past}
+        self._source.go_on_at(max((self._place(done) + 1 for done in range(index)), default=0), shown)
 
     def _place(self, index: int) -> int:
         """The frame of the recording that a camera without an offset shows."""

@@ -15,14 +15,14 @@ from bundle import Bundle
 
 from gsstream.core.changes import AddedGaussians, Delta, Layout, RowEdit, Scene
 from gsstream.core.errors import ComponentError
-from gsstream.core.frame import Frame
+from gsstream.core.frame import Arrival, Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.encode import Callbacks, Encoder, encoder_for, open_recording
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.densify import DensifyStatistics
 from gsstream.engine.frame0 import refine
 from gsstream.engine.frame0.axes import nearest_axes
-from gsstream.engine.frame0.refine import track_motion
+from gsstream.engine.frame0.refine import is_refined, iterations_in, pace_after, track_motion
 from gsstream.engine.keys import keyframes
 from gsstream.engine.run.encoder import EncodedFrame
 from gsstream.engine.run.measure import HeldOut
@@ -30,6 +30,7 @@ from gsstream.engine.run.run_frame import SkippedWorkWarning
 from gsstream.engine.state.stream_state import Refinement
 from gsstream.packet import PlayerState, quantise_key
 from gsstream.parts.render.activations import rotation_matrices
+from gsstream.recipe.model import Stream
 
 WORLD = "synthetic:frames=6&views=4&width=48&height=32&supersample=1&static=1"
 SETTINGS: Mapping[str, Any] = {
@@ -215,7 +216,8 @@ def refinement(gaussians: Gaussians[np.ndarray], ancestors: list[int]) -> Refine
         torch.tensor(ancestors),
         {},
         DensifyStatistics.zeros(count, torch.device("cpu")),
-        0,
+        iterations=0,
+        pace=1,
     )
 
 
@@ -277,3 +279,22 @@ def test_the_key_packet_holds_the_refined_scene() -> None:
         *(np.unique(np.column_stack([v.reshape(len(v), -1) for _, v in g.items()]), axis=0) for g in (ours, theirs))
     )
     assert step.state.player.meta.extra["shown"] == 3
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_refinement_of_a_capture_takes_the_time_that_the_stream_leaves(seed: int) -> None:
+    """Over any run of frames that wait, are dropped or are in time: within the recipe, and none while one waits."""
+    draw = np.random.default_rng(seed)
+    stream = Stream(refine_frames=int(draw.integers(1, 30)), refine_iterations=int(draw.integers(1, 200)))
+    most, now = stream.refine_iterations, refinement(some(2, 0), [0, 1])
+    for _ in range(300):
+        behind, skipped = draw.random() < 0.3, draw.random() < 0.1
+        frame = replace(frames()[1], epoch_scale=float(not skipped), arrival=Arrival(None, waiting=int(behind)))
+        made, pace = iterations_in(stream, now, frame), pace_after(stream, now.pace, frame)
+        assert (made > 0) == (not behind and not skipped and not is_refined(stream, now))
+        assert made <= now.pace
+        assert (pace < now.pace or pace == 1) if behind or skipped else (pace > now.pace or pace == most)
+        now = replace(now, iterations=now.iterations + made, pace=pace)
+        assert now.iterations <= stream.refine_frames * most
+    left = stream.refine_frames * most - now.iterations
+    assert iterations_in(stream, now, frames()[1]) == min(left, most), "a finished recording leaves all time"

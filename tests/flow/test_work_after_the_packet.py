@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -95,23 +96,48 @@ def test_a_run_killed_in_the_refinement_resumes_to_the_same_bytes(
     assert [line["frame"] for line in metrics(tmp_path)] == list(range(6))
 
 
+def come(finished: Path, live: Path, *frames: int) -> None:
+    """Every camera's image of these frames, renamed into a folder that is followed."""
+    for frame, camera in product(frames, json.loads((live / "cameras.json").read_text())["cameras"]):
+        target = live / (camera["frames"] % frame)
+        target.parent.mkdir(exist_ok=True)
+        shutil.copy(finished / (camera["frames"] % frame), live / "part")
+        (live / "part").replace(target)
+
+
+def growing(tmp_path: Path, *there: int, frames: int) -> tuple[Path, Path]:
+    """A finished recording, and a folder that has its calibration and some of its frames."""
+    finished, live = demo_copy(tmp_path / "scene", frames=frames), tmp_path / "live"
+    capture.begin(finished, live)
+    come(finished, live, *there)
+    return finished, live
+
+
+def during_refinements(monkeypatch: pytest.MonkeyPatch, happens: Callable[[int], object]) -> None:
+    """Call ``happens`` with the index of every frame that moves or goes on with the refinement, before it does."""
+    advanced = refine.advance_refinement
+
+    def busy(*args: Any, **named: Any) -> Any:
+        happens(named["frame"].index)
+        return advanced(*args, **named)
+
+    monkeypatch.setattr(refine, "advance_refinement", busy)
+
+
 def test_no_latency_contains_its_own_refinement_but_the_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By a clock on which every refinement takes a thousand seconds; the packet is in the file when it begins."""
     clock, held = [0.0], []
-    advanced = refine.advance_refinement
+    finished, live = growing(tmp_path, 0, 1, frames=5)
 
-    def slow(*args: Any, **named: Any) -> Any:
+    def slow(frame: int) -> None:
         clock[0] += 1000.0
         held.append(written(tmp_path / "run" / "stream.gss")[-1])
-        return advanced(*args, **named)
+        come(finished, live, frame + 1)
 
-    monkeypatch.setattr(refine, "advance_refinement", slow)
+    during_refinements(monkeypatch, slow)
     shifted = SimpleNamespace(time=lambda: time.time() + clock[0], perf_counter=time.perf_counter)
     monkeypatch.setattr(session, "time", shifted)
-    folder = demo_copy(tmp_path / "scene", frames=5)
-    for image in folder.glob("*/*.jpg"):
-        image.touch()  # latency counts from here
-    encode(tmp_path / "run", source=f"watch:{folder}", **{**QUICK, **REFINED})
+    encode(tmp_path / "run", "--frames", "5", source=f"watch:{live}?ready=rename", **{**QUICK, **REFINED})
     assert held == [1, 2, 2], "frame 3 brings the refined scene: its packet follows its iterations"
     lines = metrics(tmp_path / "run")
     assert [int(line["live"]["latency_seconds"] // 1000) for line in lines] == [0, 0, 1, 3, 3]
@@ -121,31 +147,42 @@ def test_no_latency_contains_its_own_refinement_but_the_last(tmp_path: Path, mon
 def test_frames_that_come_during_the_refinement_wait_as_the_policy_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A packet that is out does not make the encoder idle: four frames come while frame 1 is refined."""
-    finished, live = demo_copy(tmp_path / "scene", frames=6), tmp_path / "live"
-    capture.begin(finished, live)
-    patterns = [camera["frames"] for camera in json.loads((live / "cameras.json").read_text())["cameras"]]
+    """A packet that is out does not make the encoder idle: four frames come while frame 1 is refined.
 
-    def come(frame: int) -> None:
-        for pattern in patterns:
-            (live / (pattern % frame)).parent.mkdir(exist_ok=True)
-            shutil.copy(finished / (pattern % frame), live / "part")
-            (live / "part").replace(live / (pattern % frame))
-
-    come(0)
-    come(1)
-    advanced = refine.advance_refinement
-
-    def busy(*args: Any, **named: Any) -> Any:
-        if named["frame"].index == 1:
-            for frame in range(2, 6):
-                come(frame)
-            (live / "END").touch()
-        return advanced(*args, **named)
-
-    monkeypatch.setattr(refine, "advance_refinement", busy)
-    source = f"watch:{live}?behind=drop&queue=1&ready=rename"
-    encode(tmp_path / "run", source=source, **{**QUICK, **REFINED})
+    After them the refinement goes on at a lower pace; and a run that is resumed anywhere goes on to the same bytes.
+    """
+    finished, live = growing(tmp_path, 0, 1, frames=6)
+    during_refinements(monkeypatch, lambda frame: come(finished, live, *(range(2, 6) if frame == 1 else ())))
+    command = {"source": f"watch:{live}?behind=drop&queue=1&ready=rename", **QUICK, **REFINED}
+    encode(tmp_path / "run", "--frames", "6", **command)
     lines = metrics(tmp_path / "run")
     assert [line["live"]["policy"] for line in lines] == [None, None, "dropped", "dropped", "dropped", None]
-    assert [line.get("refine_iterations") for line in lines] == [None, 6, 0, 0, 0, 6]
+    assert [line.get("refine_iterations") for line in lines] == [None, 6, 0, 0, 0, 1]
+
+
+@pytest.mark.parametrize("done", [2, 5])  # in between, fewer frames wait than when it was decided to drop them
+def test_a_run_that_was_refined_among_dropped_frames_resumes_to_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done: int
+) -> None:
+    finished, live = growing(tmp_path, 0, 1, frames=6)
+    during_refinements(monkeypatch, lambda frame: come(finished, live, *(range(2, 6) if frame == 1 else ())))
+    command = {"source": f"watch:{live}?behind=drop&queue=1&ready=rename", **QUICK}
+    command |= {"stream__refine_frames": 2, "stream__refine_iterations": 1}
+    once = encode(tmp_path / "run", "--frames", "6", **command)
+    lines = metrics(tmp_path / "run")
+    assert [line.get("refine_iterations") for line in lines] == [None, 1, 0, 0, 0, 1]
+    assert lines[5]["key_reason"] == "refined"
+    kept = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines(keepends=True)[:done]
+    (tmp_path / "run" / "metrics.jsonl").write_text("".join(kept))
+    assert encode(tmp_path / "run", "--frames", "6", "--resume", **command) == once
+
+
+def test_a_refinement_without_time_makes_no_iteration_and_keeps_back_one_key_packet(tmp_path: Path) -> None:
+    """All frames are there at once: another one always waits. Players can join at the second key packet."""
+    _, live = growing(tmp_path, *range(8), frames=8)
+    (live / "END").touch()
+    encode(tmp_path / "run", source=f"watch:{live}", codec__key_interval=2, **{**QUICK, **REFINED})
+    lines = metrics(tmp_path / "run")
+    assert [line["status"] for line in lines] == ["key", *5 * ["delta"], "key", "delta"]
+    assert lines[6]["key_reason"] == "period"
+    assert sum(line.get("refine_iterations", 0) for line in lines) == 0

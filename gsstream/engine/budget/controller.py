@@ -52,7 +52,7 @@ class Controller:
             return f"about {seconds:.2f} s where {self.budget.time:g} s are allowed for the frame"
         return None
 
-    def settle(self, step: Step[Any], allowed: FrameBudget, views: int, log: FrameLog) -> None:
+    def settle(self, step: Step[Any], allowed: FrameBudget, views: int, log: FrameLog, idle: float = 0.0) -> None:
         """Log what a finished frame cost, what bound it and what it gave up, and plan with that from then on.
 
         Arguments:
@@ -61,8 +61,9 @@ class Controller:
             views: training cameras, an iteration for each of which is an epoch.
             log: its log. A method that has made iterations, or has logged its own use as ``budget``, is described by
                 that, or else by its phases and the size of its packet.
+            idle: seconds of it in which the encoder would have waited for the next frame.
         """
-        numbers, seconds, entry = log.numbers, log.elapsed(), dict[str, Any]()
+        numbers, seconds, entry = log.numbers, log.elapsed() - idle, dict[str, Any]()
         actual = {"time": seconds, "size": len(step.packet.data), "memory": 1e6 * peak_memory_mb()}
         known = actual if allowed.is_limited else ("memory",)
         limits = {name: limit for name in known if (limit := getattr(self.budget, name)) is not None}

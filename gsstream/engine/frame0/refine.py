@@ -5,6 +5,9 @@ iterations, some in every frame, each on the pictures of that frame. Motions of 
 Gaussian that was split or copied from another one moves with that one. Nothing of it is sent before the last iteration:
 then a key packet brings the scene (``engine.keys.keyframes``). So a frame's iterations follow its packet, which does
 not wait for them; those of the last frame precede it, because that packet brings what they make.
+
+A recording that is still being written does not wait either: a frame behind which another one waits makes no
+iteration, and the frames after it make fewer, so that the refinement takes the time that the stream leaves.
 """
 
 from __future__ import annotations
@@ -29,10 +32,21 @@ from gsstream.method.tools import Tools
 from gsstream.packet import PlayerState
 from gsstream.parts.render.activations import quat_multiply_torch, rotation_matrices
 from gsstream.parts.render.exposure import Exposure
-from gsstream.recipe.model import Stream
+from gsstream.recipe.model import Recipe, Stream
 
 #: Entry of the meta of every key packet but a stream's first: the frame whose pictures its scene shows.
 SHOWN = "shown"
+#: Iterations that the first frame of a recording that is still being written makes: how many it has time for is not
+#: known yet.
+FIRST_PACE = 8
+
+
+def refine_after_packet(assembly: Assembly, state: StreamState, step: Step, frame: Frame, tools: Tools) -> Step:
+    """Return a step whose packet is out with the refinement after its frame, unless iterations preceded the packet."""
+    state, stream = with_time_for_keys(assembly.recipe, state, frame), assembly.recipe.stream
+    if state.refinement is None or not runs_after_packet(stream, state.refinement, frame):
+        return step
+    return refine_first_frame(assembly, state, step, frame=frame, tools=tools)
 
 
 def refine_first_frame(assembly: Assembly, state: StreamState, step: Step, frame: Frame, tools: Tools) -> Step:
@@ -53,8 +67,39 @@ def refine_first_frame(assembly: Assembly, state: StreamState, step: Step, frame
 
 def runs_after_packet(stream: Stream, refinement: Refinement, frame: Frame) -> bool:
     """Return whether a frame's iterations of the refinement may follow its packet: the last ones of all may not."""
-    more = stream.refine_iterations if frame.epoch_scale > 0 else 0
-    return refinement.iterations + more < _iterations(stream)
+    return refinement.iterations + iterations_in(stream, refinement, frame) < _iterations(stream)
+
+
+def iterations_in(stream: Stream, refinement: Refinement, frame: Frame) -> int:
+    """Return how many iterations a frame makes."""
+    if frame.epoch_scale == 0:
+        return 0
+    most = min(stream.refine_iterations, _iterations(stream) - refinement.iterations)
+    if frame.arrival is None:
+        return most
+    return 0 if frame.arrival.waiting else min(most, refinement.pace)
+
+
+def pace_after(stream: Stream, pace: int, frame: Frame) -> int:
+    """Return how many iterations the next frame may make: a quarter more, or half where this one was behind."""
+    if frame.arrival is None:
+        return pace
+    if frame.epoch_scale == 0 or frame.arrival.waiting:
+        return max(1, pace // 2)
+    return min(stream.refine_iterations, pace + max(1, pace // 4))
+
+
+def with_time_for_keys(recipe: Recipe, state: StreamState, frame: Frame) -> StreamState:
+    """Return the state that a frame goes on from, without a refinement that kept back too many key packets.
+
+    Later key packets wait for the end of a refinement, but not for good: where the machine leaves it no time, the
+    second of them ends it, so that players can join.
+    """
+    every, stream, before = recipe.codec.key_interval, recipe.stream, state.refinement
+    if before is None or not every or is_refined(stream, before):
+        return state
+    late = frame.index - state.key_frame >= 2 * max(every, stream.refine_frames)
+    return replace(state, refinement=None) if late else state
 
 
 def is_to_be_refined(stream: Stream, player: PlayerState) -> bool:
@@ -84,6 +129,7 @@ def start_refinement(player: PlayerState) -> Refinement:
         moments={},
         statistics=DensifyStatistics.zeros(count, CPU),
         iterations=0,
+        pace=FIRST_PACE,
     )
 
 
@@ -97,8 +143,10 @@ def advance_refinement(
     rng: Rng,
 ) -> Refinement:
     """Return the refinement after a frame: moved as the stream moved, and optimised on the frame's pictures."""
-    start, stream = track_motion(refinement, before, after), assembly.recipe.stream
-    if frame.epoch_scale == 0 or is_refined(stream, start):
+    stream = assembly.recipe.stream
+    last = refinement.iterations + iterations_in(stream, refinement, frame)
+    start = replace(track_motion(refinement, before, after), pace=pace_after(stream, refinement.pace, frame))
+    if last == start.iterations:
         return start
     generator = rng.stream("refine", frame.index)
     pyramid = one_size(_iterations(stream), assembly.recipe.first_frame)
@@ -109,13 +157,13 @@ def advance_refinement(
     run.statistics = start.statistics.to(run.device)
     for name, held in start.moments.items():
         run.table.load_moments(name, held)
-    last = start.iterations + stream.refine_iterations
     for _ in run.passes(start.iterations + 1, last):
         pass
     moments = {name: {key: value.to(CPU) for key, value in run.table.moments(name).items()} for name in ATTRIBUTES}
     found = run.gaussians().map(lambda value: value.detach().to(CPU))
     ancestors = start.ancestors[run.ancestors.to(CPU)]
-    return Refinement(
+    return replace(
+        start,
         gaussians=found,
         levels=run.levels.to(CPU),
         ancestors=ancestors,

@@ -60,7 +60,7 @@ def _due(assembly: Assembly, step: Step) -> str | None:
     every, state = assembly.recipe.codec.key_interval, step.state
     if step.status == "key":
         return None
-    if state.refinement is not None:  # a periodic one would end the refinement: it waits for the refined one
+    if state.refinement is not None:  # a periodic one would end the refinement, and waits while that has time
         return REFINED if is_refined(assembly.recipe.stream, state.refinement) else None
     return "period" if every and state.player.frame - state.key_frame >= every else None
 

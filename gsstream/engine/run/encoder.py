@@ -154,7 +154,9 @@ class Encoder:
             with one_torch_thread():
                 step = run_follow_up(self.method, self.state, step, frame=frame, tools=tools)
         if self.controller is not None:
-            self.controller.settle(step, tools.budget, len(frame.cameras), log)
+            # The refinement of a capture takes the time that the stream leaves (``engine.frame0.refine``).
+            idle = 0.0 if frame.arrival is None else log.seconds("refine")
+            self.controller.settle(step, tools.budget, len(frame.cameras), log, idle=idle)
         log.set(cpu_seconds=time.process_time() - worked, peak_memory_mb=peak_memory_mb())
         self.state = step.state
         return EncodedFrame(

@@ -9,7 +9,14 @@ from gsstream.core.errors import InputError
 from gsstream.core.frame import Frame
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import begin
-from gsstream.engine.frame0.refine import is_to_be_refined, refine_first_frame, runs_after_packet, start_refinement
+from gsstream.engine.frame0.refine import (
+    is_to_be_refined,
+    refine_after_packet,
+    refine_first_frame,
+    runs_after_packet,
+    start_refinement,
+    with_time_for_keys,
+)
 from gsstream.engine.frame0.reuse import reuse_first_frame
 from gsstream.engine.keys.keyframes import key_packet_if_due
 from gsstream.engine.keys.resume import refinement_after, state_after
@@ -53,6 +60,8 @@ class PartsMethod(StreamingMethod[StreamState]):
         return step
 
     def step(self, state: StreamState, frame: Frame, tools: Tools) -> Step:
+        if state.refinement is not None:
+            state = with_time_for_keys(self.slots.recipe, state, frame)
         step = frame_step(self.slots, state, frame, tools)
         if state.refinement is not None:
             if runs_after_packet(self.slots.recipe.stream, state.refinement, frame):
@@ -61,9 +70,8 @@ class PartsMethod(StreamingMethod[StreamState]):
         return key_packet_if_due(self.slots, step, frame, tools, before=state.player)
 
     def follow_up(self, state: StreamState, step: Step, frame: Frame, tools: Tools) -> Step:
-        refinement = state.refinement
-        if refinement is not None and runs_after_packet(self.slots.recipe.stream, refinement, frame):
-            return refine_first_frame(self.slots, state, step, frame=frame, tools=tools)
+        if state.refinement is not None:
+            return refine_after_packet(self.slots, state, step, frame=frame, tools=tools)
         return step
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> StreamState:

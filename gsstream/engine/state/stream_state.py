@@ -40,6 +40,7 @@ class Refinement:
     moments: Mapping[str, Mapping[str, torch.Tensor]]
     statistics: DensifyStatistics  # of the screen gradients since Gaussians were last added
     iterations: int  # made so far
+    pace: int  # iterations that the next frame of a live recording may make
 
 
 class Resident(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +55,10 @@ class FrameBudget:
     def is_limited(self) -> bool:
         """Whether there is a limit on bytes or on time."""
         return self.max_bytes is not None or self.seconds is not None
+
+    def at_most(self, epochs: int) -> FrameBudget:
+        """Return a budget of no more than so many passes, however much time is left."""
+        return replace(self, epochs=min(epochs, self.epochs), max_epochs=min(epochs, self.max_epochs))
 
     def seconds_left(self) -> float | None:
         """Return the seconds until the frame should be over, by the budget's clock; None: no limit."""

@@ -20,8 +20,9 @@ from gsstream.core.progress import ProgressDisplay
 from gsstream.discovery.catalog import load_catalog
 from gsstream.encode import assemble, recipe_for
 from gsstream.engine.run.few_cameras import AROUND, ONE_SIDE, expectation, first_frame_summary, widest_gap
-from gsstream.engine.run.live import COUNTED, latency_lines, latency_words, live_metrics
+from gsstream.engine.run.live import COUNTED, latency_lines, latency_words, live_metrics, past_moments
 from gsstream.engine.run.progress import RunProgress
+from gsstream.input.recordings.base import Moment
 
 
 class Clock:
@@ -193,8 +194,16 @@ def latency_line(index: int, latency: float | None, policy: str | None = None) -
 def test_a_frame_has_one_policy_and_frame_0_none(
     index: int, effort: float, absent: tuple[str, ...], policy: str | None
 ) -> None:
-    got = entry(index, effort, Arrival(10.5, absent))
-    assert got == {"latency_seconds": 1.5, "policy": policy, "epoch_scale": effort, "absent": list(absent)}
+    got = entry(index, effort, Arrival(10.5, absent, waiting=2))
+    assert got == {
+        "latency_seconds": 1.5,
+        "policy": policy,
+        "epoch_scale": effort,
+        "absent": list(absent),
+        "waiting": 2,
+    }
+    came = past_moments([{"frame": index, "live": got}])[index]
+    assert came == Moment(effort, Arrival(None, absent, waiting=2)), "a run that goes on takes it for what it was"
 
 
 def test_a_clock_that_is_ahead_shows_and_nothing_is_said_of_recordings_that_are_not_live() -> None:

@@ -112,13 +112,14 @@ class WatchSource(CameraSource):
 
     def waiting(self, index: int) -> int:
         """Return how many frames after this one have come of all training cameras."""
-        self._newest = max(self._newest, index)
+        newest = max(self._newest, index)
         last = float("inf") if self._declared is None else self._declared - 1
         # What a camera that is gone does not send keeps no frame from having come.
         names = self._train - self._gone or self._train
-        while self._newest < last and all(self._path(name, self._newest + 1).exists() for name in names):
-            self._newest += 1
-        return self._newest - index
+        while newest < last and all(self._path(name, newest + 1).exists() for name in names):
+            newest += 1
+        self._newest = newest  # the frame that is read ahead is planned at the same time: two counts must not add up
+        return newest - index
 
     def go_on_at(self, index: int, past: Mapping[int, Moment]) -> None:
         """Plan the frames before this one as ``past`` has them, and those that it lacks by the files that are there."""
@@ -175,7 +176,7 @@ class WatchSource(CameraSource):
         if not any(self._path(name, index).exists() for name in self._ids):
             self._numbers.left_out(index, over=True)
         lost = () if came.arrival is None else came.arrival.absent
-        skipped = came.epoch_scale == 0 and not lost
+        skipped = index > 0 and came.epoch_scale == 0 and not lost
         there = {name for name in self._ids if name not in lost and self._path(name, index).exists()}
         held = [name for name in self._ids if (skipped or name not in there) and name in self._last]
         self._keep(_Plan(came.epoch_scale, tuple((name, self._last[name]) for name in held), skipped=skipped))

@@ -7,6 +7,8 @@ import os
 import shutil
 import threading
 import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ import pytest
 from gsstream.core.errors import EndOfRecording, SourceError
 from gsstream.core.frame import Arrival
 from gsstream.input.recordings import watch
-from gsstream.input.recordings.base import Source
+from gsstream.input.recordings.base import Moment, Source
 from gsstream.input.recordings.images import read_stored
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
 from gsstream.input.recordings.options import DataOptions
@@ -218,3 +220,57 @@ def test_grace_is_counted_by_the_files_when_the_run_lags_behind(folder: Path) ->
     frame = live.frame(1)
     assert time.monotonic() - began < 50
     assert np.array_equal(frame.images[0], live.frame(0).images[0])
+
+
+def undeclared(folder: Path) -> Path:
+    """The folder as one whose calibration does not say how many frames there will be."""
+    data = json.loads((folder / "cameras.json").read_text())
+    del data["frames"]
+    (folder / "cameras.json").write_text(json.dumps(data))
+    return folder
+
+
+def a_picture_comes_late(folder: Path, camera: str) -> list[Path]:
+    return [folder / camera / "000003.jpg", *folder.glob("cam*/00000[6-9].jpg")]
+
+
+def more_wait_than_may(folder: Path, camera: str) -> list[Path]:
+    return list(folder.glob("cam*/00001*.jpg"))
+
+
+def numbers_are_left_out(folder: Path, camera: str) -> list[Path]:
+    for path in folder.glob("cam*/00000[23].jpg"):
+        path.unlink()
+    return list(folder.glob("cam*/00000[89].jpg"))
+
+
+@pytest.mark.parametrize("case", [a_picture_comes_late, more_wait_than_may, numbers_are_left_out])
+@pytest.mark.filterwarnings("ignore:.*no camera has a frame between the numbers 1 and 4")
+def test_a_run_that_goes_on_sees_what_it_saw(folder: Path, case: Callable[[Path, str], list[Path]]) -> None:
+    """Whatever came since, and however many frames wait by now; ``case`` says which pictures come later."""
+    query = f"watch:{undeclared(folder)}?missing=hold&grace=0&behind=drop&queue=3&ready=rename"
+    later = case(folder, open_source(query).info.train.ids[0])
+    for path in later:
+        path.rename(path.with_suffix(".later"))
+    first = open_source(query, 0.25)
+    before = [first.stored_frame(t) for t in range(5)]
+    past = {frame.index: Moment(frame.epoch_scale, frame.arrival) for frame in before}
+    for path in later:
+        path.with_suffix(".later").rename(path)
+    again = open_source(query, 0.25)
+    again.go_on_at(5, past)
+    for was in before:
+        now = again.stored_frame(was.index)
+        assert np.array_equal(now.images, was.images), f"frame {was.index}"
+        assert (now.epoch_scale, now.arrival.absent) == (was.epoch_scale, was.arrival.absent)
+    numbers = sorted(int(path.stem) for path in folder.glob(f"{first.info.train.ids[0]}/*.jpg"))
+    assert again.waiting(5) == len(numbers) - 6
+
+
+def test_two_who_count_what_waits_at_once_do_not_add_up(folder: Path) -> None:
+    """A frame is planned ahead on one thread while the frame in turn is asked for on another."""
+    undeclared(folder)
+    for _ in range(20):
+        live = open_source(f"watch:{folder}")
+        with ThreadPoolExecutor(8) as pool:
+            assert set(pool.map(live.waiting, [0] * 64)) == {11}

@@ -97,8 +97,8 @@ def test_a_run_killed_in_the_refinement_resumes_to_the_same_bytes(
 
 
 def come(finished: Path, live: Path, *frames: int) -> None:
-    """Every camera's image of these frames, renamed into a folder that is followed."""
-    for frame, camera in product(frames, json.loads((live / "cameras.json").read_text())["cameras"]):
+    """Every camera's image of these frames, renamed into a folder that is followed; all are there once the first is."""
+    for frame, camera in product(reversed(frames), json.loads((live / "cameras.json").read_text())["cameras"]):
         target = live / (camera["frames"] % frame)
         target.parent.mkdir(exist_ok=True)
         shutil.copy(finished / (camera["frames"] % frame), live / "part")

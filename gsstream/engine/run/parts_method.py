@@ -70,9 +70,9 @@ class PartsMethod(StreamingMethod[StreamState]):
         return key_packet_if_due(self.slots, step, frame, tools, before=state.player)
 
     def follow_up(self, state: StreamState, step: Step, frame: Frame, tools: Tools) -> Step:
-        if state.refinement is not None:
-            return refine_after_packet(self.slots, state, step, frame=frame, tools=tools)
-        return step
+        return (
+            step if state.refinement is None else refine_after_packet(self.slots, state, step, frame=frame, tools=tools)
+        )
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> StreamState:
         state = replace(state_after(self.slots, tools.since_key(), tools.rng), previous=shown)

@@ -46,13 +46,8 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
 
     Raises ComponentError when a part fails.
     """
-    log, rng, scope, budget = (
-        tools.log,
-        tools.rng,
-        assembly.update.scope(frame.index),
-        # While the first frame is refined, what the recipe's passes leave of the time is for that.
-        tools.budget if state.refinement is None else tools.budget.at_most(assembly.recipe.stream.epochs),
-    )
+    log, rng, scope = tools.log, tools.rng, assembly.update.scope(frame.index)
+    budget = tools.budget if state.refinement is None else tools.budget.at_most(assembly.recipe.stream.epochs)
     if frame.epoch_scale == 0:  # a skipped frame: a source that is behind does not read its images
         return empty_step(state, frame, log)
     with log.phase("change"):

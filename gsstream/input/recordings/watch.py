@@ -14,6 +14,7 @@ from typing import Any
 from gsstream.core.errors import EndOfRecording, SourceError
 from gsstream.core.frame import Arrival, PointCloud
 from gsstream.core.storage import packed
+from gsstream.input.recordings.backlog import Backlog
 from gsstream.input.recordings.base import CameraSource, Moment, PointKind, SourceInfo
 from gsstream.input.recordings.calibration import CALIBRATION_FILE, Calibration, is_video, read_calibration
 from gsstream.input.recordings.depth_maps import FOLDER
@@ -55,11 +56,11 @@ class WatchSource(CameraSource):
         self._target = scaled_size(self._native, scale)
         self._ids = (*calibration.train.ids, *calibration.test.ids)
         self._train = frozenset(calibration.train.ids)
-        self._declared = calibration.num_frames or None
+        declared = calibration.num_frames or None
         self._info = SourceInfo(
             name=calibration.name,
             uri=str(folder),
-            num_frames=self._declared,
+            num_frames=declared,
             fps=calibration.fps,
             train=calibration.train.scaled(*self._target),
             test=calibration.test.scaled(*self._target),
@@ -67,9 +68,9 @@ class WatchSource(CameraSource):
             depth_maps=folder / FOLDER,
         )
         self._plans: dict[int, _Plan] = {}  # only frames that are not delivered whole
-        self._next, self._skip_to, self._newest, self._ahead = 0, 0, 0, 0
-        self._gone: frozenset[str] = frozenset()  # cameras that the last frame was made without
+        self._next, self._ahead = 0, 0
         self._numbers = Numbering(folder, calibration.patterns)
+        self._backlog = Backlog(self._path, self._train, declared, options)
         self._decoded: dict[tuple[str, int], Any] = {}  # of the frame that is waited for
         self._faults: dict[str, str] = {}
         self._last: dict[str, int] = {}
@@ -108,18 +109,11 @@ class WatchSource(CameraSource):
 
     def epoch_scale(self, index: int) -> float:
         """Return what a frame is worth now that its turn has come: more may wait than when it was read ahead."""
-        return 1.0 if index == 0 else min(self._plan(index).epoch_scale, self._effort(index))
+        return 1.0 if index == 0 else min(self._plan(index).epoch_scale, self._backlog.effort(index))
 
     def waiting(self, index: int) -> int:
         """Return how many frames after this one have come of all training cameras."""
-        newest = max(self._newest, index)
-        last = float("inf") if self._declared is None else self._declared - 1
-        # What a camera that is gone does not send keeps no frame from having come.
-        names = self._train - self._gone or self._train
-        while newest < last and all(self._path(name, newest + 1).exists() for name in names):
-            newest += 1
-        self._newest = newest  # the frame that is read ahead is planned at the same time: two counts must not add up
-        return newest - index
+        return self._backlog.behind(index)
 
     def go_on_at(self, index: int, past: Mapping[int, Moment]) -> None:
         """Plan the frames before this one as ``past`` has them, and those that it lacks by the files that are there."""
@@ -184,29 +178,15 @@ class WatchSource(CameraSource):
     def _decide(self, index: int) -> _Plan:
         if self._info.num_frames is not None and index >= self._info.num_frames:
             raise EndOfRecording(f"the recording ended after {self._info.num_frames} frames")
-        if 0 < index < self._skip_to:  # images of all training cameras came, and newer ones
+        if 0 < index < self._backlog.skip_to:  # images of all training cameras came, and newer ones
             return _Plan(0.0, tuple((name, self._last[name]) for name in self._ids), skipped=True)
         absent = self._wait(index)
-        self._gone = frozenset(absent)
+        self._backlog.gone = frozenset(absent)
         untrained = [name for name in absent if name in self._train]
         held = tuple((name, self._last[name]) for name in absent)
         if untrained and self._options.missing == "drop":
             return _Plan(0.0, held)
-        return _Plan(self._effort(index), held)
-
-    def _effort(self, index: int) -> float:
-        """1 while the run keeps up; less when more frames wait than the queue may hold."""
-        if self._options.behind == "block":
-            return 1.0
-        if index < self._skip_to:
-            return 0.0
-        waiting = self.waiting(index)
-        if waiting <= self._options.queue:
-            return 1.0
-        if self._options.behind == "hurry":
-            return max(self._options.min_epoch_scale, self._options.queue / waiting)
-        self._skip_to = self._newest
-        return 0.0
+        return _Plan(self._backlog.effort(index), held)
 
     def _wait(self, index: int) -> list[str]:
         """Wait until every camera's image is there and whole, or the policy gives up; the cameras that are absent."""

@@ -61,6 +61,29 @@ def check_optimiser_adam(part: Renderer) -> None:
 
 
 @check("renderer")
+def check_optimiser_ahead(part: Renderer) -> None:
+    """Steps that look ahead are those of Adam by the mean that would follow if the same gradient came once more.
+
+    So where all gradients of a row are one, each step is as long as the learning rate, from the first on.
+    """
+    for rate in (0.01, torch.full((3,), 0.01), torch.full((9, 1), 0.01)):
+        values = _tables()["means"]
+        wanted, mean, square = values.double(), torch.zeros(9, 3).double(), torch.zeros(9, 3).double()
+        state, same = AdamState.start(values, ahead=True), _gradients(3)["means"]
+        for step in range(1, 2 * STEPS):
+            now = same if step < STEPS else _gradients(step)["means"]
+            before = values.clone()
+            part.optimiser.step({"means": values}, {"means": now}, {"means": state}, {"means": rate})
+            mean += (1 - ADAM_BETAS[0]) * (now - mean)
+            square += (1 - ADAM_BETAS[1]) * (now.double() ** 2 - square)
+            after = (mean + (1 - ADAM_BETAS[0]) * (now - mean)) / (1 - ADAM_BETAS[0] ** (step + 1))
+            wanted -= 0.01 * after / ((square / (1 - ADAM_BETAS[1] ** step)).sqrt() + ADAM_EPS)
+            if step < STEPS:
+                equal("a step of one gradient", before - values, 0.01 * same.sign(), tolerance=1e-5, why=WHY)
+        equal("means", values, wanted.float(), tolerance=1e-5, why=WHY)
+
+
+@check("renderer")
 def check_optimiser_rows(part: Renderer) -> None:
     """A row that joins later is corrected by its own count; a table without a gradient neither moves nor counts."""
     values, gradients = _tables(), _gradients(0)

@@ -31,7 +31,7 @@ class TrainedGates:
         self._nodes, node_of = torch.unique(hierarchy.node_of[rows], return_inverse=True)
         self.hierarchy = _roots(node_of, len(self._nodes))
         self.logits = logits.detach()[self._nodes].requires_grad_()
-        self.state = AdamState.start(self.logits)
+        self.state = AdamState.start(self.logits, ahead=True)
         self._ahead: list[torch.Tensor | None] = []
 
     @property

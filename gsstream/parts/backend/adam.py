@@ -62,9 +62,11 @@ class ReferenceAdam(RowOptimiser):
         """
         state.exp_avg.lerp_(gradient, 1 - ADAM_BETAS[0])
         state.exp_avg_sq.mul_(ADAM_BETAS[1]).addcmul_(gradient, gradient, value=1 - ADAM_BETAS[1])
-        first, second = corrections[state.steps.clamp_max(len(corrections) - 1)].unbind(1)
+        usual, ahead, second = corrections[state.steps.clamp_max(len(corrections) - 1)].unbind(1)
+        mean = torch.lerp(state.exp_avg, gradient, 1 - ADAM_BETAS[0]) if state.ahead else state.exp_avg
+        first = ahead if state.ahead else usual
         wide = (-1, *[1] * (value.dim() - 1))
-        step, denominator = state.exp_avg * first.reshape(wide), state.exp_avg_sq.sqrt() + second.reshape(wide)
+        step, denominator = mean * first.reshape(wide), state.exp_avg_sq.sqrt() + second.reshape(wide)
         if isinstance(lr, torch.Tensor):
             value.addcdiv_(step.mul_(lr), denominator, value=-1)
         else:
@@ -74,15 +76,17 @@ class ReferenceAdam(RowOptimiser):
 
 @functools.cache
 def bias_corrections(device: torch.device) -> torch.Tensor:
-    """Return [SATURATED + 1, 2] by the number n of steps: a factor on the first moment, and what stands for epsilon.
+    """Return [SATURATED + 1, 3] by the number n of steps: factors on the first moment, and what stands for epsilon.
 
-    They are sqrt(1 - b2^n) / (1 - b1^n) and epsilon sqrt(1 - b2^n), which is Adam's step with the correction of the
-    second moment taken out of the fraction. They are looked up, because to compute them takes ten times as many
-    operations, in double precision. Those of no step are never used.
+    They are sqrt(1 - b2^n) / (1 - b1^n), the same with b1^(n + 1) for steps that look ahead, and epsilon
+    sqrt(1 - b2^n), which is Adam's step with the correction of the second moment taken out of the fraction. They are
+    looked up, because to compute them takes ten times as many operations, in double precision. Those of no step are
+    never used.
     """
     steps = torch.arange(SATURATED + 1, dtype=torch.float64).clamp_min(1)
-    first, second = (1 - beta**steps for beta in ADAM_BETAS)
-    return torch.stack([second.sqrt() / first, ADAM_EPS * second.sqrt()], 1).float().to(device)
+    first, ahead, second = 1 - ADAM_BETAS[0] ** steps, 1 - ADAM_BETAS[0] ** (steps + 1), 1 - ADAM_BETAS[1] ** steps
+    root = second.sqrt()
+    return torch.stack([root / first, root / ahead, ADAM_EPS * root], 1).float().to(device)
 
 
 def _too_large(name: str) -> ShapeError:

@@ -24,21 +24,24 @@ class AdamState:
     Arguments:
         exp_avg, exp_avg_sq: like the table, running means of the gradient and of its square.
         steps: [n] int32, updates that each row has taken. A row that joins later starts with zeros.
+        ahead: each step goes where the next mean of gradients would be if this gradient came again: Nesterov's momentum
+            (Dozat 2016), with the weights of all gradients corrected to a sum of 1.
     """
 
     exp_avg: torch.Tensor
     exp_avg_sq: torch.Tensor
     steps: torch.Tensor
+    ahead: bool = False
 
     @staticmethod
-    def start(values: torch.Tensor) -> AdamState:
+    def start(values: torch.Tensor, ahead: bool = False) -> AdamState:
         """Return the state before any step, for a table ``values`` [n, ...]."""
         zeros = torch.zeros_like(values, requires_grad=False)
-        return AdamState(zeros, zeros.clone(), torch.zeros(len(values), dtype=torch.int32, device=values.device))
+        return AdamState(zeros, zeros.clone(), torch.zeros(len(values), dtype=torch.int32, device=values.device), ahead)
 
     def rows(self, rows: torch.Tensor) -> AdamState:
         """Return the state of these rows [K]."""
-        return AdamState(self.exp_avg[rows], self.exp_avg_sq[rows], self.steps[rows])
+        return AdamState(self.exp_avg[rows], self.exp_avg_sq[rows], self.steps[rows], self.ahead)
 
 
 class RowSteps(Protocol):
@@ -82,11 +85,16 @@ class RowParameters:
     """Named leaves [n, ...], one learning rate each, moved by a row optimiser."""
 
     def __init__(
-        self, values: Mapping[str, torch.Tensor], lrs: Mapping[str, float | torch.Tensor], optimiser: RowSteps
+        self,
+        values: Mapping[str, torch.Tensor],
+        lrs: Mapping[str, float | torch.Tensor],
+        optimiser: RowSteps,
+        *,
+        ahead: bool = False,
     ) -> None:
         self.leaves = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
         self._lrs, self._optimiser = dict(lrs), optimiser
-        self._states = {name: AdamState.start(leaf) for name, leaf in self.leaves.items()}
+        self._states = {name: AdamState.start(leaf, ahead) for name, leaf in self.leaves.items()}
 
     def __getitem__(self, name: str) -> torch.Tensor:
         return self.leaves[name]
@@ -138,4 +146,5 @@ class RowParameters:
         """Continue from moments saved by :meth:`moments`; an empty mapping starts fresh."""
         if moments:
             device = self.leaves[name].device
-            self._states[name] = AdamState(**{key: value.to(device, copy=True) for key, value in moments.items()})
+            first, second, steps = (moments[key].to(device, copy=True) for key in ("exp_avg", "exp_avg_sq", "steps"))
+            self._states[name] = AdamState(first, second, steps, self._states[name].ahead)

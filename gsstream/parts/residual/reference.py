@@ -26,8 +26,8 @@ class JointResidualOptimiser(ResidualOptimiser[RenderSession]):
         self._code, self._base, self._units, self._optimiser = code, base, units, optimiser
         self._features = join_features(code, base)
         start = base.means.new_zeros(len(base), code.width)
-        self._latents = RowParameters({"latents": start}, {"latents": code.lrs}, optimiser)
-        self._decoders = RowParameters({"matrix": matrix}, {"matrix": code.decoder_lrs}, optimiser)
+        self._latents = RowParameters({"latents": start}, {"latents": code.lrs}, optimiser, ahead=True)
+        self._decoders = RowParameters({"matrix": matrix}, {"matrix": code.decoder_lrs}, optimiser, ahead=True)
 
     @property
     def latents(self) -> torch.Tensor:

@@ -17,12 +17,18 @@ def drawn(rng: np.random.Generator, *shape: int) -> torch.Tensor:
     return torch.from_numpy(rng.standard_normal(shape).astype(np.float32))
 
 
-def by_hand(value: np.ndarray, m: np.ndarray, v: np.ndarray, t: np.ndarray, grad: np.ndarray, lr: Any) -> None:
-    """One step (Kingma and Ba 2015, algorithm 1) of rows that have taken ``t`` steps each, in place."""
+def by_hand(
+    value: np.ndarray, m: np.ndarray, v: np.ndarray, t: np.ndarray, grad: np.ndarray, lr: Any, ahead: bool
+) -> None:
+    """One step (Kingma and Ba 2015, algorithm 1) of rows that have taken ``t`` steps each, in place.
+
+    One that looks ahead goes by the mean that would follow if the gradient came once more.
+    """
     t += 1
     m += (1 - ADAM_BETAS[0]) * (grad - m)
     v += (1 - ADAM_BETAS[1]) * (grad * grad - v)
-    first = m / (1 - ADAM_BETAS[0] ** t[:, None])
+    next_mean = m + (1 - ADAM_BETAS[0]) * (grad - m)
+    first = (next_mean if ahead else m) / (1 - ADAM_BETAS[0] ** (t[:, None] + ahead))
     second = v / (1 - ADAM_BETAS[1] ** t[:, None])
     value -= lr * first / (np.sqrt(second) + ADAM_EPS)
 
@@ -43,12 +49,13 @@ def test_all_rows_equal_torch_in_float64(isa: str, d: int) -> None:
     np.testing.assert_allclose(value, reference.detach(), rtol=0, atol=2e-6)
 
 
+@pytest.mark.parametrize("ahead", [False, True])
 @pytest.mark.parametrize("rates", ["number", "by column", "by row"])
 @pytest.mark.parametrize("d", [1, 3, 24, 61])
-def test_rows_of_any_age_and_rates_of_any_kind(isa: str, rates: str, d: int) -> None:
+def test_rows_of_any_age_and_rates_of_any_kind(isa: str, rates: str, d: int, ahead: bool) -> None:
     """Neighbours of one age form one long row in the kernel: here some do, some do not."""
     rng = np.random.default_rng(d)
-    value, state = drawn(rng, 61, d), AdamState.start(torch.zeros(61, d))
+    value, state = drawn(rng, 61, d), AdamState.start(torch.zeros(61, d), ahead)
     state.steps.copy_(torch.from_numpy(np.repeat(rng.integers(0, 400, 21), 3)[:61].astype(np.int32)))
     state.exp_avg.copy_(0.1 * drawn(rng, 61, d))
     state.exp_avg_sq.copy_(0.1 * drawn(rng, 61, d).abs())
@@ -58,7 +65,7 @@ def test_rows_of_any_age_and_rates_of_any_kind(isa: str, rates: str, d: int) -> 
     t = state.steps.numpy().astype(np.int64)
     for _ in range(20):
         gradient = drawn(rng, 61, d) * 10.0 ** int(rng.integers(-6, 2))
-        by_hand(wanted, m, v, t, gradient.numpy().astype(np.float64), lr if shape == () else lr.numpy())
+        by_hand(wanted, m, v, t, gradient.numpy().astype(np.float64), lr if shape == () else lr.numpy(), ahead)
         step_table("means", value, gradient, state, lr)
     np.testing.assert_array_equal(state.steps, t)
     np.testing.assert_allclose(value, wanted, rtol=0, atol=1e-5)

@@ -97,8 +97,9 @@ def test_a_value_that_is_not_finite_shows_in_the_loss() -> None:
         assert not value.isfinite()
 
 
+@pytest.mark.parametrize("ahead", [False, True])
 @pytest.mark.parametrize("lr", ["number", "scalar", "columns", "rows"])
-def test_a_table_is_moved_as_the_reference_moves_it(lr: str) -> None:
+def test_a_table_is_moved_as_the_reference_moves_it(lr: str, ahead: bool) -> None:
     g = torch.Generator().manual_seed(5)
     rows, width = 300, 7  # more than one program, and none of them full
     rates: dict[str, Any] = {
@@ -108,13 +109,13 @@ def test_a_table_is_moved_as_the_reference_moves_it(lr: str) -> None:
         "rows": 0.01 * torch.rand(rows, 1, generator=g),
     }
     rate = rates[lr] if lr == "number" else rates[lr].to(DEVICE)
-    corrections = torch.rand(6, 2, generator=g).to(DEVICE)
+    corrections = torch.rand(6, 3, generator=g).to(DEVICE)
     made = [torch.randn(rows, width, generator=g), 10 ** torch.empty(rows, width).uniform_(-9, 4, generator=g)]
     made += [torch.randn(rows, width, generator=g), torch.rand(rows, width, generator=g)]
     steps = torch.randint(0, 9, (rows,), generator=g, dtype=torch.int32)  # more than the corrections have: the last one
     ours, theirs = ([x.clone().to(DEVICE) for x in (*made, steps)] for _ in range(2))
-    assert bool(FUSED.move_table(*ours, corrections, rate))
-    TORCH_FUSED.move_table(*theirs, corrections, rate)
+    assert bool(FUSED.move_table(*ours, corrections, rate, ahead))
+    TORCH_FUSED.move_table(*theirs, corrections, rate, ahead)
     assert torch.equal(ours[4], theirs[4])
     for got, want in zip(ours[:4], theirs[:4], strict=True):
         assert torch.allclose(got, want, rtol=2e-6, atol=1e-7)
@@ -125,11 +126,11 @@ def test_a_gradient_that_is_too_large_is_told(wrong: float) -> None:
     assert adam.MOST == MAX_GRADIENT
     for at in (0, 511, 512, 2099):
         value, first, second, gradient = torch.zeros(4, 300, 7, device=DEVICE).unbind()
-        steps, corrections = torch.ones(300, dtype=torch.int32, device=DEVICE), torch.ones(2, 2, device=DEVICE)
+        steps, corrections = torch.ones(300, dtype=torch.int32, device=DEVICE), torch.ones(2, 3, device=DEVICE)
         gradient.fill_(MAX_GRADIENT)
-        assert bool(FUSED.move_table(value, gradient, first, second, steps, corrections, 0.1))
+        assert bool(FUSED.move_table(value, gradient, first, second, steps, corrections, 0.1, ahead=False))
         gradient.view(-1)[at] = wrong
-        assert not bool(FUSED.move_table(value, gradient, first, second, steps, corrections, 0.1))
+        assert not bool(FUSED.move_table(value, gradient, first, second, steps, corrections, 0.1, ahead=False))
 
 
 @pytest.mark.parametrize("as_tensor", [False, True])
@@ -270,7 +271,7 @@ def compiled(function, **constants):
     source = ASTSource(function, signature, constexprs=constants)
     return triton.compile(source, target=GPUTarget("cuda", int(sys.argv[1]), 32)).asm["cubin"]
 
-found = [compiled(adam._move, as_table=True, block=512)]
+found = [compiled(adam._move, as_table=True, ahead=ahead, block=512) for ahead in (0, 1)]
 found += [compiled(kernel, as_bytes=True, all_tiles=False) for kernel in (loss._compare, loss._pull_back)]
 found += [compiled(boxes._find, side=16, block=256), compiled(boxes._cover, wide=32)]
 found += [compiled(rate._sum, rows=256, wide=16), compiled(rate._price, as_tensor=True, rows=256, wide=16)]
@@ -289,4 +290,4 @@ def test_the_kernels_compile_for_a_gpu_that_is_not_here(architecture: str, tmp_p
         [sys.executable, "-W", "ignore", "-c", COMPILE, architecture], env=environment, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split()[-1] == "13"
+    assert done.stdout.split()[-1] == "14"

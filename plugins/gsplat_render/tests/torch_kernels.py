@@ -237,8 +237,9 @@ def move_table(
     steps: torch.Tensor,
     corrections: torch.Tensor,
     lr: float | torch.Tensor,
+    ahead: bool,
 ) -> torch.Tensor:
-    state = AdamState(exp_avg, exp_avg_sq, steps)
+    state = AdamState(exp_avg, exp_avg_sq, steps, ahead)
     ReferenceAdam().move(value, gradient, state, corrections, lr=lr)
     return (gradient.abs() <= MAX_GRADIENT).all()
 

@@ -25,7 +25,7 @@ def step_table(
     table = [part.numpy().reshape(rows, -1) for part in (value, gradient.detach().contiguous())]
     moments = [part.numpy().reshape(rows, -1) for part in (state.exp_avg, state.exp_avg_sq)]
     try:
-        bad = _native.adam_update(*table, *moments, state.steps.numpy(), *rates, *ADAM_BETAS, ADAM_EPS)
+        bad = _native.adam_update(*table, *moments, state.steps.numpy(), *rates, *ADAM_BETAS, ADAM_EPS, state.ahead)
     except (TypeError, ValueError) as error:
         for label, tensor in (("values", value), ("gradient", gradient), ("exp_avg", state.exp_avg)):
             native_array(f"{label} of {name}", tensor, table[0].dtype.type, tuple(value.shape))

@@ -34,7 +34,10 @@ class CpuResidualOptimiser(ResidualOptimiser[CpuSession]):
         self._native = _native.ResidualTable(_blocks(code), code.width, matrix.shape[1])
         self._latents = torch.zeros(len(base), code.width).requires_grad_()
         self._matrix = matrix.detach().clone()
-        self._states = {"latents": AdamState.start(self._latents), "matrix": AdamState.start(self._matrix)}
+        self._states = {
+            "latents": AdamState.start(self._latents, ahead=True),
+            "matrix": AdamState.start(self._matrix, ahead=True),
+        }
         self._pending: tuple[torch.Tensor, torch.Tensor] | None = None
 
     @property
@@ -163,7 +166,7 @@ def _table(values: torch.Tensor, state: AdamState) -> tuple[object, ...]:
     """A table of values [n, ...] and the state of Adam, as the kernels take them."""
     rows = len(values)
     parts = [part.detach().numpy().reshape(rows, -1) for part in (values, state.exp_avg, state.exp_avg_sq)]
-    return (*parts, state.steps.numpy())
+    return (*parts, state.steps.numpy(), state.ahead)
 
 
 def _blocks(code: JointLayout) -> list[tuple[int, int, int, int, bool, bool]]:

@@ -35,6 +35,7 @@ def _move(
     slow,
     slower,
     as_table: tl.constexpr,
+    ahead: tl.constexpr,
     block: tl.constexpr,
 ):
     """Both moments and the values of ``block`` elements; row i has taken ``steps[i]`` steps, this one included.
@@ -54,11 +55,14 @@ def _move(
     square = tl.load(second + place, mask=there, other=0.0)
     mean += slow * (gradient - mean)
     square = square * (1 - slower) + slower * gradient * gradient
-    factor = tl.load(corrections + 2 * taken, mask=there, other=0.0)
-    least = tl.load(corrections + 2 * taken + 1, mask=there, other=1.0)
+    factor = tl.load(corrections + 3 * taken + ahead, mask=there, other=0.0)
+    least = tl.load(corrections + 3 * taken + 2, mask=there, other=1.0)
+    way = mean
+    if ahead:
+        way = mean + slow * (gradient - mean)
     if as_table:
         rate = tl.load(rates + row * by_row + (place % width) * by_column, mask=there, other=0.0)
-    change = rate * tl.div_rn(mean * factor, tl.sqrt_rn(square) + least)
+    change = rate * tl.div_rn(way * factor, tl.sqrt_rn(square) + least)
     tl.store(first + place, mean, mask=there)
     tl.store(second + place, square, mask=there)
     tl.store(values + place, tl.load(values + place, mask=there, other=0.0) - change, mask=there)
@@ -72,6 +76,7 @@ def move_table(
     steps: torch.Tensor,
     corrections: torch.Tensor,
     lr: float | torch.Tensor,
+    ahead: bool,
 ) -> torch.Tensor:
     """Move a table [n, ...] and both of its moments in place, as ``ReferenceAdam.move`` does.
 
@@ -101,6 +106,7 @@ def move_table(
         slow=1 - ADAM_BETAS[0],
         slower=1 - ADAM_BETAS[1],
         as_table=is_table,
+        ahead=int(ahead),
         block=BLOCK,
     )
     return is_well

@@ -63,13 +63,13 @@ def load_fused(device: str) -> Fused | None:
     from gsstream_gsplat_render.rows import put_rows, take_rows
 
     image, mask = torch.zeros(16, 16, 3, device=device), torch.ones(1, 1, dtype=torch.bool, device=device)
-    steps, corrections = torch.ones(1, dtype=torch.int32, device=device), torch.ones(2, 2, device=device)
+    steps, corrections = torch.ones(1, dtype=torch.int32, device=device), torch.ones(2, 3, device=device)
     try:
         for tiles in (None, mask):
             _, by_window = loss_by_tile(image, image.byte(), 0.2, tiles)
             gradient_by_pixel(image, image.byte(), by_window, 0.2, tiles)
-        for lr in (0.1, image[0, 0]):
-            move_table(image[0, :1], image[1, :1], image[2, :1], image[3, :1], steps, corrections, lr)
+        for lr, ahead in ((0.1, False), (image[0, 0], True)):
+            move_table(image[0, :1], image[1, :1], image[2, :1], image[3, :1], steps, corrections, lr, ahead)
             sums = sum_symbols(image[5], corrections.flatten()[:3])
             add_rate(image[4], image[5], corrections.flatten()[:3], image[6, :, 0], sums, lr)
         rows = torch.zeros(2, dtype=torch.int64, device=device)
@@ -165,7 +165,7 @@ class FusedAdam(ReplayedAdam):
         if not self._fused.serves(value):
             return super().move(value, gradient, state, corrections, lr=lr)
         moments = (state.exp_avg, state.exp_avg_sq, state.steps)
-        is_well: torch.Tensor = self._fused.move_table(value, gradient, *moments, corrections, lr)
+        is_well: torch.Tensor = self._fused.move_table(value, gradient, *moments, corrections, lr, ahead=state.ahead)
         return is_well
 
     def add_rate(

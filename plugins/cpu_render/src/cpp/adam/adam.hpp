@@ -18,6 +18,7 @@ struct AdamJob {
   double lr, beta1, beta2, eps;
   const float* lr_columns;  // [columns] or null
   const float* lr_rows;     // [rows] or null
+  bool ahead;               // steps go where the next mean would be if this gradient came again (Nesterov; Dozat 2016)
 };
 
 struct AdamKernels {

@@ -12,6 +12,7 @@ constexpr float MAX_GRADIENT = 1e18f;
 
 struct Factors {
   Floats beta1, rest1, beta2, rest2, eps, size, root2;  // size = lr / (1 - beta1^t), root2 = 1 / sqrt(1 - beta2^t)
+  Floats kept, now;  // shares of the mean and of the gradient in a step: 1 and 0, or beta1 and rest1 where it looks ahead
 };
 
 // `size` is the step already multiplied by the learning rate of each lane.
@@ -19,7 +20,7 @@ GSS_INLINE void update_lanes(Floats& param, Floats grad, Floats& m, Floats& v, c
   m = f.beta1 * m + f.rest1 * grad;
   v = f.beta2 * v + f.rest2 * (grad * grad);
   const Floats bottom = GSS_ISA::sqrt(v) * f.root2 + f.eps;
-  param -= size * (m / bottom);
+  param -= size * ((f.kept * m + f.now * grad) / bottom);
 }
 
 // The first `count` < LANES floats; other lanes are 0 and are not touched in memory.
@@ -72,7 +73,7 @@ struct Correction {
     if (t == step) return;
     step = t;
     const double power = static_cast<double>(t);
-    size = 1.0 / (1.0 - std::pow(job.beta1, power));
+    size = 1.0 / (1.0 - std::pow(job.beta1, job.ahead ? power + 1.0 : power));
     root2 = 1.0 / std::sqrt(1.0 - std::pow(job.beta2, power));
   }
 };
@@ -93,6 +94,8 @@ void update(const AdamJob& job, std::size_t begin, std::size_t end) {
   f.beta2 = broadcast(static_cast<float>(job.beta2));
   f.rest2 = broadcast(static_cast<float>(1.0 - job.beta2));
   f.eps = broadcast(static_cast<float>(job.eps));
+  f.kept = job.ahead ? f.beta1 : broadcast(1.0f);
+  f.now = job.ahead ? f.rest1 : broadcast(0.0f);
   Correction correction;
   const std::size_t d = job.columns;
   const double common = job.lr_columns ? 1.0 : job.lr;

@@ -31,7 +31,7 @@ void require_vector(const std::optional<Array>& array, std::size_t size, const c
 
 int64_t update(FloatArray param, ConstFloatArray grad, FloatArray exp_avg, FloatArray exp_avg_sq, StepArray step,
                double lr, std::optional<ConstFloatArray> lr_columns, std::optional<ConstFloatArray> lr_rows, double beta1,
-               double beta2, double eps) {
+               double beta2, double eps, bool ahead) {
   require(param.ndim() == 2, "param must be [N, d]");
   AdamJob job{};
   job.rows = param.shape(0);
@@ -54,6 +54,7 @@ int64_t update(FloatArray param, ConstFloatArray grad, FloatArray exp_avg, Float
   job.beta1 = beta1;
   job.beta2 = beta2;
   job.eps = eps;
+  job.ahead = ahead;
   const nb::gil_scoped_release released;
   const int64_t bad = adam_first_bad(job);
   if (bad < 0) adam_run(job);
@@ -66,7 +67,7 @@ void bind_adam(nb::module_& module) {
   module.def("adam_update", &update, nb::arg("param").noconvert(), nb::arg("grad").noconvert(),
              nb::arg("exp_avg").noconvert(), nb::arg("exp_avg_sq").noconvert(), nb::arg("step").noconvert(),
              nb::arg("lr"), nb::arg("lr_columns").noconvert().none(), nb::arg("lr_rows").noconvert().none(),
-             nb::arg("beta1"), nb::arg("beta2"), nb::arg("eps"),
+             nb::arg("beta1"), nb::arg("beta2"), nb::arg("eps"), nb::arg("ahead"),
              "Adam in place. Returns -1, or the flat index of a gradient value that is not finite or beyond 1e18 (then nothing "
              "was changed).");
 }

@@ -112,13 +112,13 @@ class PyResidualTable {
 
 using StepArray = nb::ndarray<int32_t, nb::c_contig, nb::device::cpu>;
 using NodeArray = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
-// Values [n, d], Adam's two moments of them, and the steps that each row has taken [n].
-using Trained = std::tuple<FloatArray, FloatArray, FloatArray, StepArray>;
+// Values [n, d], Adam's two moments of them, the steps that each row has taken [n], and whether they look ahead.
+using Trained = std::tuple<FloatArray, FloatArray, FloatArray, StepArray, bool>;
 // A rasteriser, what its view is compared with, which rows wait, and a factor on the rates.
 using View = std::tuple<nb::object, nb::object, std::optional<ByteArray>, double>;
 
 AdamJob adam_of(const Trained& trained, const std::tuple<double, double, double>& betas_eps) {
-  const auto& [values, first, second, steps] = trained;
+  const auto& [values, first, second, steps, ahead] = trained;
   require(values.ndim() == 2 && first.size() == values.size() && second.size() == values.size() &&
               steps.size() == values.shape(0),
           "Adam's moments must have the shape of their table");
@@ -129,6 +129,7 @@ AdamJob adam_of(const Trained& trained, const std::tuple<double, double, double>
   job.exp_avg = first.data();
   job.exp_avg_sq = second.data();
   job.step = steps.data();
+  job.ahead = ahead;
   std::tie(job.beta1, job.beta2, job.eps) = betas_eps;
   return job;
 }

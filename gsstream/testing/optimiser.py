@@ -66,21 +66,19 @@ def check_optimiser_ahead(part: Renderer) -> None:
 
     So where all gradients of a row are one, each step is as long as the learning rate, from the first on.
     """
-    for rate in (0.01, torch.full((3,), 0.01), torch.full((9, 1), 0.01)):
-        values = _tables()["means"]
-        wanted, mean, square = values.double(), torch.zeros(9, 3).double(), torch.zeros(9, 3).double()
-        state, same = AdamState.start(values, ahead=True), _gradients(3)["means"]
-        for step in range(1, 2 * STEPS):
-            now = same if step < STEPS else _gradients(step)["means"]
-            before = values.clone()
-            part.optimiser.step({"means": values}, {"means": now}, {"means": state}, {"means": rate})
-            mean += (1 - ADAM_BETAS[0]) * (now - mean)
-            square += (1 - ADAM_BETAS[1]) * (now.double() ** 2 - square)
-            after = (mean + (1 - ADAM_BETAS[0]) * (now - mean)) / (1 - ADAM_BETAS[0] ** (step + 1))
-            wanted -= 0.01 * after / ((square / (1 - ADAM_BETAS[1] ** step)).sqrt() + ADAM_EPS)
-            if step < STEPS:
-                equal("a step of one gradient", before - values, 0.01 * same.sign(), tolerance=1e-5, why=WHY)
-        equal("means", values, wanted.float(), tolerance=1e-5, why=WHY)
+    values, same = _tables()["means"], _gradients(3)["means"]
+    wanted, mean, square = values.double(), torch.zeros(9, 3).double(), torch.zeros(9, 3).double()
+    state = AdamState.start(values, ahead=True)
+    for step in range(1, 2 * STEPS):
+        now, before = same if step < STEPS else _gradients(step)["means"], values.clone()
+        part.optimiser.step({"means": values}, {"means": now}, {"means": state}, {"means": 0.01})
+        mean += (1 - ADAM_BETAS[0]) * (now - mean)
+        square += (1 - ADAM_BETAS[1]) * (now.double() ** 2 - square)
+        after = (mean + (1 - ADAM_BETAS[0]) * (now - mean)) / (1 - ADAM_BETAS[0] ** (step + 1))
+        wanted -= 0.01 * after / ((square / (1 - ADAM_BETAS[1] ** step)).sqrt() + ADAM_EPS)
+        if step < STEPS:
+            equal("a step of one gradient", before - values, 0.01 * same.sign(), tolerance=1e-5, why=WHY)
+    equal("means", values, wanted.float(), tolerance=1e-5, why=WHY)
 
 
 @check("renderer")

@@ -13,7 +13,7 @@ from gsstream.core.errors import SourceError
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.shapes import FloatArray, check_finite, check_shape
 from gsstream.core.storage import packed
-from gsstream.input.recordings.base import Source, Split, Wrapped
+from gsstream.input.recordings.base import Moment, Source, Split, Wrapped
 from gsstream.input.recordings.canonical import CanonicalSource, recording_similarity
 from gsstream.input.recordings.options import DataOptions
 from gsstream.input.recordings.transformed import transformed
@@ -118,6 +118,17 @@ def check_source_threads(subject: SourceUnderTest) -> None:
 
 
 @check("source")
+def check_source_goes_on(subject: SourceUnderTest) -> None:
+    """Told that a run goes on, it reads the frames that were encoded before as it has read them."""
+    with subject.open() as source:
+        seen = [source.frame(index) for index in _some(source)]
+        last = max(frame.index for frame in seen)
+        source.go_on_at(last + 1, {frame.index: Moment(frame.epoch_scale, frame.arrival) for frame in seen})
+        for frame in seen:
+            _same_images("after go_on_at", source.frame(frame.index), frame)
+
+
+@check("source")
 def check_source_bounds(subject: SourceUnderTest) -> None:
     """Frames that it has not are refused by SourceError that names them."""
     with subject.open() as source:
@@ -213,7 +224,7 @@ def check_source_wrapped(subject: SourceUnderTest) -> None:
     assert not own - set(vars(Wrapped)), f"Wrapped does not forward {', '.join(sorted(own - set(vars(Wrapped))))}"
     with subject.open() as opened:
         for what, source in _wrapped(opened):
-            for name in ("stores_bytes", "epoch_scale", "moment"):
+            for name in ("stores_bytes", "epoch_scale", "moment", "waiting"):
                 answers = [getattr(one, name) for one in (source, opened)]
                 wrapped, plain = (answer(0) if callable(answer) else answer for answer in answers)
                 assert wrapped == plain, f"{what}: {name}: expected {plain}, got {wrapped}"

@@ -115,6 +115,14 @@ class Halved(Adam):
         super().step(values, gradients, states, halved)
 
 
+@brought("check_optimiser_ahead")
+class Behind(Adam):
+    """Goes by the mean so far where it should look ahead."""
+
+    def step(self, values: Any, gradients: Any, states: Any, lrs: Any) -> None:
+        super().step(values, gradients, {n: replace(state, ahead=False) for n, state in states.items()}, lrs)
+
+
 @brought("check_optimiser_rows")
 class OneCount(Adam):
     """One count of steps for all rows."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from gsstream.core.frame import Frame, PointCloud
 from gsstream.core.storage import to_bytes
+from gsstream.input.recordings.base import Moment
 from gsstream.testing.examples.source import ExampleSource
 from gsstream.testing.registry import SourceUnderTest
 from saboteurs.register import spoils
@@ -89,6 +90,19 @@ class OneReader(ExampleSource):
         self.place = index
         time.sleep(0.02)  # long enough for another thread to move the position
         return replace(super().frame(self.place, split), index=index, timestamp=index / self.info.fps)
+
+
+@_spoils("check_source_goes_on")
+class AtTheStart(ExampleSource):
+    """Where a run goes on, all that was before is the first frame."""
+
+    done = 0
+
+    def go_on_at(self, index: int, past: Mapping[int, Moment]) -> None:
+        self.done = index
+
+    def frame(self, index: int, split: str = "train") -> Frame:
+        return replace(super().frame(0 if 0 <= index < self.done else index, split), index=index)
 
 
 @_spoils("check_source_bounds")

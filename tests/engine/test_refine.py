@@ -91,6 +91,15 @@ def test_a_size_that_no_key_packet_keeps_puts_it_off_and_says_so() -> None:
     assert [text.startswith("refined: ") for text in said] == [False, False, True, True, True]
 
 
+@pytest.mark.parametrize("refined", [0, 2])
+def test_what_passes_leave_of_a_budget_of_time_is_for_the_refinement(refined: int) -> None:
+    """Two passes are the recipe's; a minute would be enough for all thirty that a budget may buy."""
+    settings = {"stream.epochs": 2, "stream.change_threshold": 0, "budget.time": "60s"}
+    made = steps(**settings, **{"stream.refine_frames": refined, "stream.refine_iterations": min(refined, 1)})
+    passes = [step.metrics["iterations"] / len(frames()[0].cameras) for step in made[1:] if step.status != "key"]
+    assert [number <= 2 for number in passes] == [True] * (refined - 1) + [False] * (len(passes) - max(0, refined - 1))
+
+
 def told(monkeypatch: pytest.MonkeyPatch, efforts: tuple[float, ...]) -> list[str]:
     """What happens in which order: packets that are handed out, and iterations of the refinement."""
     out: list[str] = []

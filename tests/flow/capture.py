@@ -14,6 +14,7 @@ import signal
 import sys
 import threading
 import time
+from itertools import product
 from pathlib import Path
 
 
@@ -64,6 +65,14 @@ def begin(finished: Path, folder: Path) -> None:
     del data["frames"]
     (folder / "cameras.json").write_text(json.dumps(data))
     shutil.copy(finished / "points_frame0.npz", folder)
+
+
+def come(finished: Path, folder: Path, *frames: int) -> None:
+    """Every camera's image of these frames, renamed into place; all are there once the first is."""
+    for frame, camera in product(reversed(frames), json.loads((folder / "cameras.json").read_text())["cameras"]):
+        target = folder / (camera["frames"] % frame)
+        target.parent.mkdir(exist_ok=True)
+        put(finished / (camera["frames"] % frame), target, slow=0, die=False)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import product
 from pathlib import Path
 
 import pytest
@@ -187,10 +186,7 @@ def test_interrupting_while_waiting_ends_at_once_and_resume_goes_on(
 ) -> None:
     live, out = tmp_path / "live", tmp_path / "run"
     capture.begin(finished, live)
-    for camera in json.loads((live / "cameras.json").read_text())["cameras"]:
-        (live / camera["id"]).mkdir()
-        for t in range(2):
-            shutil.copy(finished / (camera["frames"] % t), live / (camera["frames"] % t))
+    capture.come(finished, live, 0, 1)
     command = arguments(out, source=f"watch:{live}?timeout=60", **QUICK)
     with Forked(command) as process:
         deadline = time.monotonic() + 50
@@ -229,23 +225,17 @@ def test_a_run_that_dropped_frames_compares_with_the_same_pictures_when_it_goes_
     """By then all its frames wait, and more than the queue holds: what it made of them is not decided once more."""
     finished, live, out = demo_copy(tmp_path / "scene", frames=6), tmp_path / "live", tmp_path / "run"
     capture.begin(finished, live)
-    images = [camera["frames"] for camera in json.loads((live / "cameras.json").read_text())["cameras"]]
-
-    def come(frames: range) -> None:
-        for t, pattern in product(frames, images):
-            (live / (pattern % t)).parent.mkdir(exist_ok=True)
-            shutil.copy(finished / (pattern % t), live / (pattern % t))
 
     def go(out: Path, source: str, frames: int, *more: str) -> None:
         settings = {**QUICK, "stream__change_threshold": 3.0}
         assert run_command(arguments(out, "--frames", str(frames), *more, source=source, **settings)) == 0
 
-    come(range(4))
+    capture.come(finished, live, *range(4))
     policy = f"watch:{live}?behind=drop&queue=2"
     go(out, policy, 4)
     assert [line["live"]["policy"] for line in metrics(out)] == [None, "dropped", "dropped", None]
     shutil.copytree(out, tmp_path / "other")
-    come(range(4, 6))
+    capture.come(finished, live, 4, 5)
     go(out, policy, 6, "--resume")
     go(tmp_path / "other", str(finished), 6, "--resume")  # which makes no policy of what it reads
     assert packets(out / STREAM) == packets(tmp_path / "other" / STREAM)

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 import time
 from collections.abc import Callable, Iterator
-from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -96,20 +93,11 @@ def test_a_run_killed_in_the_refinement_resumes_to_the_same_bytes(
     assert [line["frame"] for line in metrics(tmp_path)] == list(range(6))
 
 
-def come(finished: Path, live: Path, *frames: int) -> None:
-    """Every camera's image of these frames, renamed into a folder that is followed; all are there once the first is."""
-    for frame, camera in product(reversed(frames), json.loads((live / "cameras.json").read_text())["cameras"]):
-        target = live / (camera["frames"] % frame)
-        target.parent.mkdir(exist_ok=True)
-        shutil.copy(finished / (camera["frames"] % frame), live / "part")
-        (live / "part").replace(target)
-
-
 def growing(tmp_path: Path, *there: int, frames: int) -> tuple[Path, Path]:
     """A finished recording, and a folder that has its calibration and some of its frames."""
     finished, live = demo_copy(tmp_path / "scene", frames=frames), tmp_path / "live"
     capture.begin(finished, live)
-    come(finished, live, *there)
+    capture.come(finished, live, *there)
     return finished, live
 
 
@@ -132,7 +120,7 @@ def test_no_latency_contains_its_own_refinement_but_the_last(tmp_path: Path, mon
     def slow(frame: int) -> None:
         clock[0] += 1000.0
         held.append(written(tmp_path / "run" / "stream.gss")[-1])
-        come(finished, live, frame + 1)
+        capture.come(finished, live, frame + 1)
 
     during_refinements(monkeypatch, slow)
     shifted = SimpleNamespace(time=lambda: time.time() + clock[0], perf_counter=time.perf_counter)
@@ -152,7 +140,7 @@ def test_frames_that_come_during_the_refinement_wait_as_the_policy_says(
     After them the refinement goes on at a lower pace; and a run that is resumed anywhere goes on to the same bytes.
     """
     finished, live = growing(tmp_path, 0, 1, frames=6)
-    during_refinements(monkeypatch, lambda frame: come(finished, live, *(range(2, 6) if frame == 1 else ())))
+    during_refinements(monkeypatch, lambda frame: capture.come(finished, live, *(range(2, 6) if frame == 1 else ())))
     command = {"source": f"watch:{live}?behind=drop&queue=1&ready=rename", **QUICK, **REFINED}
     encode(tmp_path / "run", "--frames", "6", **command)
     lines = metrics(tmp_path / "run")
@@ -165,7 +153,7 @@ def test_a_run_that_was_refined_among_dropped_frames_resumes_to_the_same_bytes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done: int
 ) -> None:
     finished, live = growing(tmp_path, 0, 1, frames=6)
-    during_refinements(monkeypatch, lambda frame: come(finished, live, *(range(2, 6) if frame == 1 else ())))
+    during_refinements(monkeypatch, lambda frame: capture.come(finished, live, *(range(2, 6) if frame == 1 else ())))
     command = {"source": f"watch:{live}?behind=drop&queue=1&ready=rename", **QUICK}
     command |= {"stream__refine_frames": 2, "stream__refine_iterations": 1}
     once = encode(tmp_path / "run", "--frames", "6", **command)

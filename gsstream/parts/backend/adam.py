@@ -62,9 +62,9 @@ class ReferenceAdam(RowOptimiser):
         """
         state.exp_avg.lerp_(gradient, 1 - ADAM_BETAS[0])
         state.exp_avg_sq.mul_(ADAM_BETAS[1]).addcmul_(gradient, gradient, value=1 - ADAM_BETAS[1])
-        usual, ahead, second = corrections[state.steps.clamp_max(len(corrections) - 1)].unbind(1)
-        mean = torch.lerp(state.exp_avg, gradient, 1 - ADAM_BETAS[0]) if state.ahead else state.exp_avg
-        first = ahead if state.ahead else usual
+        mean, (first, ahead, second) = state.exp_avg, corrections[state.steps.clamp_max(len(corrections) - 1)].unbind(1)
+        if state.ahead:
+            mean, first = torch.lerp(mean, gradient, 1 - ADAM_BETAS[0]), ahead
         wide = (-1, *[1] * (value.dim() - 1))
         step, denominator = mean * first.reshape(wide), state.exp_avg_sq.sqrt() + second.reshape(wide)
         if isinstance(lr, torch.Tensor):

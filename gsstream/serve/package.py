@@ -226,7 +226,7 @@ def _titled(page: str, name: str) -> str:
 
 
 def player_files(folder: Traversable | None = None, above: str = "") -> Iterator[tuple[str, bytes]]:
-    """Yield name and bytes of the player's files, modules of its own without comments and indentation.
+    """Yield name and bytes of the player's files, what is its own without comments and indentation.
 
     ``folder`` and ``above``: where to begin, and its name; by default all files.
     """
@@ -236,5 +236,5 @@ def player_files(folder: Traversable | None = None, above: str = "") -> Iterator
             yield from player_files(item, f"{above}{item.name}/")
         elif not item.name.startswith((".", "__")):
             data = item.read_bytes()
-            is_own = item.name.endswith(".js") and folder.name != "vendor"
+            is_own = item.name.endswith((".js", ".html")) and folder.name != "vendor"
             yield f"{above}{item.name}", _SPARE.sub(b"", data) if is_own else data

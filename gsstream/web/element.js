@@ -8,6 +8,7 @@
 import { Controls } from "./controls.js";
 import { PAGE, PAUSE, PLAY, STYLE } from "./look.js";
 import { Player } from "./player.js";
+import { LOST } from "./stream-link.js";
 
 /** What is left of a picture that is seen from as far outside of the recorded region as a hand may drag it. */
 const LEFT = 0.4;
@@ -202,8 +203,8 @@ export class PlayerElement extends HTMLElement {
   async _statistics() {
     this.parts.facts.hidden = !this.parts.facts.hidden;
     this.parts.statistics.ariaPressed = String(!this.parts.facts.hidden);
-    const { Statistics } = await import("./statistics.js");
-    this.facts ??= new Statistics(this.player);
+    const module = await import("./statistics.js").catch(() => this._tell(LOST));
+    this.facts ??= module && new module.Statistics(this.player);
     this._everySecond();
   }
 
@@ -215,9 +216,9 @@ export class PlayerElement extends HTMLElement {
   }
 
   async _headset() {
-    const { Headset } = await import("./xr.js");
-    this.headset = new Headset(this.player);
-    await this.headset.enter().catch((error) => this._tell(error.message));
+    const module = await import("./xr.js").catch(() => this._tell(LOST));
+    this.headset = module && new module.Headset(this.player);
+    await this.headset?.enter().catch((error) => this._tell(error.message));
   }
 
   _full() {

@@ -2,6 +2,8 @@
 
 /** Milliseconds of decoding on the page's own thread, after which the page gets its turn. */
 const SLICE = 8;
+/** What is said where a module does not come. */
+export const LOST = "A part of the player could not be loaded. Load the page again.";
 
 /** Posts messages to a Stream (see stream.js) and hands what it says to `hear`. */
 export class StreamLink {
@@ -53,7 +55,7 @@ export class StreamLink {
       this.stream = new Stream((message) => this.hear(message), SLICE);
       for (const message of this.sent) this.stream.hear(message);
       this.sent = null;
-    });
+    }).catch(() => this.hear({ problem: LOST, kind: "Error", ended: true }));
   }
 }
 

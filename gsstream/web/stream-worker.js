@@ -36,4 +36,7 @@ loaded.then(([{ Stream }, , , , , , { settings }]) => {
   };
   stream = new Stream((message, transfer) => self.postMessage(message, transfer ?? []), 80);
   for (const message of waiting) stream.hear(message);
+}).catch((error) => {
+  // A page hears of errors only, not of promises.
+  setTimeout(() => { throw error; });
 });

@@ -18,6 +18,15 @@ const FLAGS = [
   "--hide-scrollbars",
 ];
 
+/** What pages and the players in them show, frames with the page that holds them. */
+const SHOWN = `(function shown(at) {
+  const players = [...at.querySelectorAll("gsstream-player")].map(({ shadowRoot }) => {
+    return shadowRoot ? (shadowRoot.querySelector(".message")?.textContent ?? "nothing") : "no player yet";
+  });
+  const frames = [...at.querySelectorAll("iframe")].map(({ contentDocument }) => contentDocument && shown(contentDocument));
+  return [at.URL + ' (' + at.readyState + ') shows: ' + players.join(" | "), ...frames].join("; ");
+})(document)`;
+
 /** One browser with one page. */
 export class Browser {
   /** Start the program at `path`; `flags` are added to those it always gets. */
@@ -99,7 +108,8 @@ export class Browser {
       if (await this.evaluate(`Boolean(${expression})`)) return;
       await new Promise((resolve) => setTimeout(resolve, 50));
     }
-    throw new Error(`after ${seconds} s still not: ${expression}; the page said: ${this.messages.join("; ")}`);
+    const said = this.messages.join("; ");
+    throw new Error(`after ${seconds} s still not: ${expression}; the page said: ${said}; ${await this.evaluate(SHOWN)}`);
   }
 
   async screenshot() {

@@ -40,7 +40,9 @@ class Handler(SimpleHTTPRequestHandler):
     """A static server.
 
     ``faults``: ranges (false: always 200), cut_after (bytes), status, gone_after (files), held_after (bytes; the others
-    come once the page has asked for /mended, which ends all faults), cors (pages of other origins may read).
+    come once the page has asked for /mended, which ends all faults), cors (pages of other origins may read), lost (the
+    connection ends at the first requests for a file: its name and how many; a page that asks for /lost/NAME/COUNT sets
+    it), silent (the first request for a file of this name is never answered).
     """
 
     extensions_map = SimpleHTTPRequestHandler.extensions_map | {".js": "text/javascript"}
@@ -51,6 +53,8 @@ class Handler(SimpleHTTPRequestHandler):
     def end_headers(self) -> None:
         if self.server.faults.get("cors"):  # type: ignore[attr-defined]
             self.send_header("Access-Control-Allow-Origin", "*")
+        if "lost" in self.server.faults:  # type: ignore[attr-defined]
+            self.send_header("Cache-Control", "no-store")
         super().end_headers()
 
     def do_GET(self) -> None:
@@ -58,6 +62,16 @@ class Handler(SimpleHTTPRequestHandler):
         self.server.requests.append((self.path, self.headers.get("Range")))  # type: ignore[attr-defined]
         if self.path == "/mended":
             faults.clear()
+        if self.path.startswith("/lost/"):
+            _, _, name, count = self.path.split("/")
+            faults["lost"] = [name, int(count)]
+        if self.path.rpartition("/")[2] == faults.get("silent"):
+            del faults["silent"]
+            self.server.ended.wait()  # type: ignore[attr-defined]
+            return
+        if self._is_lost(faults.get("lost")):
+            self.close_connection = True
+            return
         if not self.path.split("?")[0].endswith(".gss"):
             super().do_GET()
             return
@@ -70,6 +84,12 @@ class Handler(SimpleHTTPRequestHandler):
             self.send_error(faults.get("status", 404))
             return
         self._send(data.read_bytes(), self.headers.get("Range"), faults)
+
+    def _is_lost(self, lost: list[Any] | None) -> bool:
+        if lost is None or lost[0] != self.path.rpartition("/")[2] or lost[1] == 0:
+            return False
+        lost[1] -= 1
+        return True
 
     def _send(self, data: bytes, wanted: str | None, faults: dict[str, Any]) -> None:
         start, end, status = 0, len(data) - 1, 200
@@ -114,16 +134,22 @@ class Handler(SimpleHTTPRequestHandler):
             self.wfile.write(part[held:])
 
 
+class Site(ThreadingHTTPServer):
+    #: A page and its workers ask for all of their modules at once, each by a connection of its own.
+    request_queue_size = 64
+
+
 @contextlib.contextmanager
 def serving(folder: Path, **faults: Any) -> Iterator[tuple[str, ThreadingHTTPServer]]:
     """Serve a folder on loopback; yields its address and the server (``requests``, ``faults``)."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(folder)))
-    server.faults, server.requests = faults, []  # type: ignore[attr-defined]
+    server = Site(("127.0.0.1", 0), partial(Handler, directory=str(folder)))
+    server.faults, server.requests, server.ended = faults, [], threading.Event()  # type: ignore[attr-defined]
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     try:
         yield f"http://127.0.0.1:{server.server_address[1]}", server
     finally:
+        server.ended.set()  # type: ignore[attr-defined]
         server.shutdown()
         server.server_close()
         thread.join()

@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from browser_runs import PLAYER, READY, WITHOUT_WORKERS, at, in_browser, needs_browser, serving, try_in_browser
+from browser_runs import (
+    MESSAGE,
+    PLAYER,
+    READY,
+    ROOT,
+    WITHOUT_WORKERS,
+    at,
+    in_browser,
+    needs_browser,
+    serving,
+    try_in_browser,
+)
 from pictures import decoded, drawn, psnr
 
 from gsstream.player.playback import Playback
@@ -22,6 +35,10 @@ POLICIES = {
 }
 #: A picture of frame 9 as text, and whether a worker decodes.
 LOOK = [["picture", 9, 32, 24], ["evaluate", f"Boolean({PLAYER}.link.worker)"], ["evaluate", MODULES]]
+#: Whether a page plays, and what it says in the place of a player or in it; ends when it does one of the two.
+SAID = f"(document.querySelector('.none')?.textContent ?? {MESSAGE})"
+PLAYS_OR_TELLS = f"{PLAYER}?.state || !['', 'Loading …'].includes({SAID})"
+FOUND = f"[Boolean({PLAYER}?.state), {SAID}]"
 
 
 def check(results: list, site, *, worker: bool) -> None:
@@ -52,6 +69,49 @@ def test_other_peoples_pages_play_whatever_they_allow(site, tmp_path, policy, el
         (site / name).write_text(text)
         results, _ = try_in_browser([["go", f"{url}/{name}"], READY, *LOOK], tmp_path)
     check(results, site, worker=worker)
+
+
+def modules_of(url: str, server, folder: Path) -> list[str]:
+    """The modules that a page and its workers ask for until the first picture is there."""
+    in_browser(at(url, [["go", "URL/index.html"], READY]), folder, size=(120, 90))
+    return sorted({path.rpartition("/")[2] for path, _ in server.requests if path.endswith(".js")})
+
+
+@pytest.mark.parametrize("requests", [1, 99])
+def test_a_module_that_does_not_come_is_done_without_or_told(site, tmp_path, requests):
+    """Each module in turn: a worker that lacks it is replaced by the page's thread, a page that lacks it says so."""
+    with serving(site, lost=["", 0]) as (url, server):
+        names = modules_of(url, server, tmp_path)
+        assert len(names) > 30
+        steps = []
+        for name in names:
+            lose = f"fetch('/lost/{name}/{requests}').then(() => 0)"
+            steps += [["evaluate", lose], ["go", "URL/index.html"], ["until", PLAYS_OR_TELLS], ["evaluate", FOUND]]
+        results, _ = try_in_browser(at(url, [["go", "URL/index.html"], READY, *steps]), tmp_path, size=(120, 90))
+    found = dict(zip(names, results[5::4], strict=True))
+    for name, (plays, told) in found.items():
+        assert plays or told.endswith("could not be loaded. Load the page again."), (name, told)
+    if requests == 1:
+        # The page has the modules of its worker itself, and asks again for those that were to come early.
+        assert sum(plays for plays, _ in found.values()) > len(names) - 4
+    else:
+        # Workers are done without; everything else is needed.
+        assert {name for name, (plays, _) in found.items() if plays} == {"sort-worker.js", "stream-worker.js"}
+
+
+def test_a_part_that_only_some_ask_for_is_told_where_it_does_not_come(site, tmp_path):
+    steps = [["go", "URL/index.html"], READY, ["evaluate", f"{ROOT}.querySelector('.statistics').click()"]]
+    with serving(site, lost=["statistics.js", 99]) as (url, _):
+        in_browser(at(url, [*steps, ["until", f"{MESSAGE}.startsWith('A part of the player')"]]), tmp_path)
+
+
+def test_a_manifest_that_is_not_answered_is_asked_for_again(site, tmp_path):
+    """The page asks for the manifest before its modules are there; here it waits a tenth of a second for it."""
+    soon = "{ const { timeout } = AbortSignal; AbortSignal.timeout = () => timeout.call(AbortSignal, 100); }"
+    sooner = ["send", "Page.addScriptToEvaluateOnNewDocument", {"source": soon}]
+    with serving(site, silent="stream.json") as (url, server):
+        in_browser(at(url, [sooner, ["go", "URL/index.html"], READY]), tmp_path)
+        assert [path for path, _ in server.requests].count("/stream.json") == 2
 
 
 def test_the_newest_of_many_seeks_wins(site, tmp_path):

@@ -198,6 +198,8 @@ def _check_encoder_s_own(meta: StreamMeta) -> None:
         maps, cameras = _object(extra["exposure"]), len(meta.train)
         _array("extra.exposure.matrix", maps.get("matrix"), (cameras, 3, 3))
         _array("extra.exposure.offset", maps.get("offset"), (cameras, 3))
+    if "gains" in extra:
+        _array("extra.gains", extra["gains"], (len(meta.train), 3))
     shown = extra.get("shown", 0)
     if isinstance(shown, bool) or not isinstance(shown, int) or shown < 0:
         raise ValueError(f"extra.shown: expected the number of a frame, got {shown!r:.60}")

@@ -10,8 +10,8 @@ from gsstream.core.changes import Delta, Layout, Residual, Scene, apply_delta, s
 from gsstream.core.gaussians import SH0
 from gsstream.encode import open_recording
 from gsstream.engine.fit.photometric import FrameImages
-from gsstream.engine.state.drift import Drift, Lit, drift, looked_at, tile_shares
-from gsstream.engine.step.light import camera_offsets
+from gsstream.engine.state.drift import Lit, cameras_apart, drift, looked_at, tile_shares
+from gsstream.engine.step.gains import camera_offsets
 from gsstream.engine.step.light_symbols import STEP, light_symbols, with_light
 from gsstream.packet import quantise_decoders
 from tests.scenes import make_scene
@@ -23,10 +23,10 @@ def pictures(rng: np.random.Generator, change: float = 0.0, noise: float = 0.0, 
     return (world + change + rng.normal(0, noise, world.shape)).astype(np.float32) / np.float32(255)
 
 
-def pixels(images: np.ndarray, stored: str = "float32", frame: int = 0) -> Lit:
+def pixels(images: np.ndarray, stored: str = "float32", frame: int = 0, gains: np.ndarray | None = None) -> Lit:
     """What is looked at of pictures [V, H, W, 3] that are stored as bytes or not."""
     kept = np.rint(images * 255).astype(np.uint8) if stored == "uint8" else images
-    return looked_at(frame, FrameImages(kept, torch.device("cpu")))
+    return looked_at(frame, FrameImages(kept, torch.device("cpu")), gains)
 
 
 @pytest.mark.parametrize("stored", ["uint8", "float32"])
@@ -61,18 +61,78 @@ def test_the_light_is_due_when_it_drifted_and_starts_anew_after_a_jump(change: f
     rng = np.random.default_rng(3)
     before, now = pixels(pictures(rng)), pixels(np.minimum(pictures(rng, change), 1), frame=5)
     found = drift(before, now, levels=1)
-    assert (found.is_due, found.lit.frame if found.lit else None) == (due, frame)
-    assert drift(None, now, levels=1) == Drift(now, False)
+    assert (found.is_due, found.lit.frame, found.apart) == (due, frame, ())
+
+
+def rig_pictures(ratios: list[float], noise: float = 2.0, seed: int = 0) -> np.ndarray:
+    """Pictures [V, 64, 80, 3] float32 of one grey wall per camera, times a factor each, with noise."""
+    world = np.random.default_rng(0).uniform(60, 180, (len(ratios), 64, 80, 3))
+    levels = world * np.reshape(ratios, (-1, 1, 1, 1)) + np.random.default_rng(seed).normal(0, noise, world.shape)
+    return levels.astype(np.float32) / np.float32(255)
+
+
+@pytest.mark.parametrize("stored", ["uint8", "float32"])
+@pytest.mark.parametrize(
+    ("ratios", "apart"),
+    [
+        ([1.0, 1.0, 1.0, 1.0], ()),
+        ([0.9, 0.9, 0.9, 0.9], ()),
+        ([1.0, 1.0, 0.98, 1.0], (2,)),
+        ([0.96, 0.96, 0.98, 0.96], (2,)),
+        ([1.02, 1.0, 0.98, 1.0, 1.0], (0, 2)),
+        ([1.0, 0.8], ()),
+        ([1.0], ()),
+    ],
+)
+def test_a_camera_leaves_the_others_by_a_level_of_what_they_do(
+    stored: str, ratios: list[float], apart: tuple[int, ...]
+) -> None:
+    """Light that all see alike is none of a camera's; of two cameras neither is most."""
+    before = pixels(rig_pictures([1.0] * len(ratios), seed=1), stored)
+    assert cameras_apart(before, pixels(rig_pictures(ratios, seed=2), stored), levels=1) == apart
+
+
+@pytest.mark.parametrize("storage", [("uint8", "float32"), ("float32", "uint8")])
+def test_a_gain_that_is_known_is_no_change(storage: tuple[str, str]) -> None:
+    """Neither of the camera nor of the light, however the two pictures are stored, and whichever of them has it."""
+    first, then = rig_pictures([1.0, 1.0, 1.0], noise=0), rig_pictures([1.0, 0.8, 1.0], noise=0)
+    gains = np.array([[1, 1, 1], [0.8, 0.8, 0.8], [1, 1, 1]], np.float32)
+    before, now = pixels(first, storage[0]), pixels(then, storage[1], frame=5, gains=gains)
+    assert cameras_apart(before, now, levels=1) == ()
+    assert tile_shares(before, now, levels=1) == (1.0, 0.0)
+    assert tile_shares(now, before, levels=1) == (1.0, 0.0)
+    assert cameras_apart(now._replace(gains=None), before, levels=1) == (1,)
+
+
+def test_a_camera_before_which_half_a_picture_moves_is_not_apart() -> None:
+    before, now = rig_pictures([1.0] * 4, seed=1), rig_pictures([1.0] * 4, seed=2)
+    now[2, :, :32] = 0.9
+    assert cameras_apart(pixels(before), pixels(now), levels=1) == ()
+
+
+@pytest.mark.parametrize("size", [(3, 5), (15, 40)])
+def test_of_pictures_without_a_tile_no_camera_is_apart(size: tuple[int, int]) -> None:
+    before, now = np.zeros((4, *size, 3), np.float32), np.zeros((4, *size, 3), np.float32)
+    now[1] = 0.5
+    assert cameras_apart(pixels(before), pixels(now), levels=1) == ()
+
+
+def test_a_black_picture_has_no_gain_that_is_not_finite() -> None:
+    before = np.zeros((4, 32, 32, 3), np.float32)
+    now = before.copy()
+    now[3] = 0.02
+    assert cameras_apart(pixels(before), pixels(now), levels=1) == (3,)
 
 
 def test_no_pass_is_due_in_the_demo_whatever_frames_are_compared() -> None:
     """Its light stays, and what moves in it is no light: so its packets hold no byte of any."""
     with open_recording("demo") as source:
         frames = [
-            looked_at(i, FrameImages(source.frame(i).as_stored().images, torch.device("cpu")))
+            looked_at(i, FrameImages(source.frame(i).as_stored().images, torch.device("cpu")), None)
             for i in range(source.info.num_frames or 0)
         ]
-    assert not any(drift(before, now, levels=1).is_due for before in frames for now in frames)
+    found = [drift(before, now, levels=1) for before in frames for now in frames]
+    assert not any(each.is_due or each.apart for each in found)
 
 
 def test_rows_and_cameras_share_what_is_asked_for_as_it_came_about() -> None:

@@ -13,8 +13,11 @@ import torch
 
 from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.log import FrameLog
+from gsstream.engine.fit.photometric import FrameImages
+from gsstream.engine.state.drift import cameras_apart, looked_at
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.context import EngineContext
+from gsstream.engine.step.gains import new_gains
 from gsstream.engine.step.light import Wanted, wanted_colours
 from gsstream.packet import PlayerState
 from gsstream.testing.cases import rig, scene
@@ -36,12 +39,12 @@ def under(light: torch.Tensor) -> Gaussians[torch.Tensor]:
     return replace(found, sh0=((found.sh0 * SH0 + 0.5) * light[:, None, None] - 0.5) / SH0)
 
 
-def context(images: np.ndarray) -> EngineContext:
+def context(images: np.ndarray, gains: np.ndarray | None = None) -> EngineContext:
     """A frame with these pictures, before which the cloud was shown as it is."""
     work = fit_fixture().work
     player = PlayerState(0, replace(fit_fixture().scene, gaussians=cloud().map(torch.Tensor.numpy)), None)  # type: ignore[arg-type]
     frame = replace(work._frame, images=images, cameras=rig(VIEWS))
-    return EngineContext(work._assembly, StreamState(player, work.hierarchy, frame), frame, FrameLog())
+    return EngineContext(work._assembly, StreamState(player, work.hierarchy, frame, gains=gains), frame, FrameLog())
 
 
 def pictures(shown: Gaussians[torch.Tensor], drift: np.ndarray | float = 0.0) -> np.ndarray:
@@ -109,6 +112,69 @@ def test_white_balance_that_drifts_is_told_by_channel() -> None:
     found = wanted(images)
     np.testing.assert_allclose(found.change * SH0, 0, atol=0.05 * LEVEL)
     np.testing.assert_allclose(found.cameras[4], shift, atol=0.05 * LEVEL)
+
+
+def gains_after(images: np.ndarray, before: np.ndarray | None = None, known: np.ndarray | None = None) -> np.ndarray:
+    """[8, 3] gains after these pictures; ``before``: those they are compared with, of which ``known`` has been told."""
+    work = context(images)
+    lit = looked_at(0, FrameImages(pictures(cloud()) if before is None else before, torch.device("cpu")), None)
+    now = looked_at(5, FrameImages(images, torch.device("cpu")), known)
+    apart = cameras_apart(lit, now, levels=1)
+    found = new_gains(work._assembly, work.gaussians, rig(VIEWS), before=lit, now=now, apart=apart)
+    return np.ones((VIEWS, 3), np.float32) if found is None else found
+
+
+def gained(shown: Gaussians[torch.Tensor], gains: dict[int, object]) -> np.ndarray:
+    """Pictures of a scene, of which some cameras' are brighter by a factor, or by one for each channel."""
+    images = pictures(shown)
+    for view, gain in gains.items():
+        images[view] *= np.asarray(gain, np.float32)
+    return images
+
+
+@pytest.mark.parametrize(
+    "drifting",
+    [{2: 0.95}, {2: 0.7}, {2: 1.2, 5: 0.9}, {0: 0.9, 3: 0.9, 6: 0.9}, {4: (1.06, 1.0, 0.95)}],
+    ids=["darker", "a jump", "two that differ", "three alike", "white balance"],
+)
+@pytest.mark.parametrize("light", ["stays", "dims", "is shaded"])
+def test_cameras_that_drift_have_their_gains_whatever_the_light_does(drifting: dict[int, object], light: str) -> None:
+    """Fewer than half of eight; those that do not drift have the gain 1, to the digit."""
+    room = under({"stays": ONE, "dims": 0.97 * ONE, "is shaded": 1 - 0.06 * SHADED}[light])
+    wanted = np.ones((VIEWS, 3))
+    for view, gain in drifting.items():
+        wanted[view] = gain
+    found = gains_after(gained(room, drifting))
+    np.testing.assert_allclose(found, wanted, atol=0.01)
+    others = [view for view in range(VIEWS) if view not in drifting]
+    assert (found[others] == 1).all()
+
+
+@pytest.mark.parametrize("light", [0.97 * ONE, 1 - 0.06 * SHADED, 1 - 0.2 * SHADED, 1.3 * ONE])
+def test_no_camera_gets_a_gain_for_light(light: torch.Tensor) -> None:
+    assert (gains_after(pictures(under(light))) == 1).all()
+
+
+def test_a_gain_goes_on_from_what_is_known() -> None:
+    """A camera that has lost a tenth loses a twentieth of the rest."""
+    known = np.ones((VIEWS, 3), np.float32)
+    known[2] = 0.9
+    found = gains_after(gained(cloud(), {2: 0.855}), known=known)
+    np.testing.assert_allclose(found[2], 0.855, atol=2e-3)
+    assert (np.delete(found, 2, 0) == 1).all()
+
+
+def test_a_frame_is_fitted_in_the_colours_that_a_camera_has_now() -> None:
+    """The scene as it is explains the picture of a camera that has lost a tenth; without the gain it does not."""
+    images = gained(cloud(), {2: 0.9})
+    gains = np.ones((VIEWS, 3), np.float32)
+    gains[2] = 0.9
+    errors = []
+    for known in (None, gains):
+        work = context(images, known)
+        errors.append(float((work.shown(work.gaussians, 2) - work.image(2)).abs().max()))
+    assert errors[0] > 0.02
+    assert errors[1] < 1e-5
 
 
 def test_a_flash_asks_for_nothing() -> None:

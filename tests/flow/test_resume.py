@@ -19,6 +19,7 @@ from gsstream.packet import StreamReader
 WORLD = "synthetic:frames=5&views=3&width=32&height=24&supersample=1"
 STILL = f"{WORLD}&static=1"
 DIMMING = "synthetic:scene=dim&event=1&frames=16&views=3&width=48&height=32&supersample=1"
+DRIFTING = "disturbed:drift=cam01@-0.02:" + DIMMING.replace("dim", "paths").replace("views=3", "views=4")
 FOLLOWED = {"stream__light": 0.5}
 SMALL: dict[str, Any] = {
     "stream__epochs": 2,
@@ -55,6 +56,11 @@ def keys(lines: Lines) -> bool:
     return [line["status"] for line in lines].count("key") == 3
 
 
+def drifts(lines: Lines) -> bool:
+    """Whether a look before the cut and one after it told of a drift."""
+    return {5, 10, 15} <= {line["frame"] for line in lines if "camera_drift" in line}
+
+
 def stands_still(lines: Lines) -> bool:
     return "empty" in [line["status"] for line in lines]
 
@@ -85,10 +91,14 @@ RUNS: dict[str, Run] = {
         3, flags=("--budget", "size=200B"), shows=lambda lines: any(line["budget"]["binding"] for line in lines[1:])
     ),
     "colours that follow the light, cut before": Run(
-        9, source=DIMMING, settings=FOLLOWED, shows=lambda lines: "camera_drift" in lines[10]
+        9, source=DIMMING, settings=FOLLOWED, shows=lambda lines: "light_bytes" in lines[10]
     ),
     "colours that follow the light, cut after": Run(
-        11, source=DIMMING, settings=FOLLOWED, shows=lambda lines: "camera_drift" in lines[10]
+        11, source=DIMMING, settings=FOLLOWED, shows=lambda lines: "light_bytes" in lines[10]
+    ),
+    "a camera that drifts, cut between two looks": Run(13, source=DRIFTING, settings=FOLLOWED, shows=drifts),
+    "a camera that drifts, cut at a look, key packets before it": Run(
+        12, source=DRIFTING, settings={**FOLLOWED, "codec__key_interval": 4}, shows=drifts
     ),
     "growing": Run(4, method="dense", grows=True),
     "growing, with shared gates": Run(4, grows=True),

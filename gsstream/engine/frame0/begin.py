@@ -31,6 +31,8 @@ from gsstream.parts.structure.base import Anchors
 
 #: What key packets say of the scene itself, which later ones say, too: colour maps of the cameras, origin of its grid.
 CARRIED = ("exposure", "origin")
+#: Where a key packet says by how much cameras have become brighter.
+GAINS = "gains"
 
 
 def begin(assembly: Assembly, frame: Frame, tools: Tools) -> Step:
@@ -150,6 +152,7 @@ def key_state(
         previous=frame,
         decoders=decoders,
         exposure=exposure_from_meta(player.meta),
+        gains=gains_from_meta(player.meta),
         key_frame=player.frame,
         shell=shell_behind(assembly, player),
         motion_memory=memory_across_key(assembly, player),
@@ -170,9 +173,13 @@ def shell_behind(assembly: Assembly, player: PlayerState) -> Shell | None:
     return find_shell(player.meta.train) if assembly.recipe.first_frame.shell else None
 
 
-def key_meta(meta: StreamMeta, exposure: Exposure | None, origin: torch.Tensor) -> StreamMeta:
-    """Return the description of the run in a key packet, with colour maps and the origin [3] of the grid."""
+def key_meta(
+    meta: StreamMeta, exposure: Exposure | None, origin: torch.Tensor, gains: FloatArray | None = None
+) -> StreamMeta:
+    """Return the description of the run in a key packet, with colour maps, gains and the origin [3] of the grid."""
     own = {**exposure_to_meta(exposure), "origin": origin.tolist()}
+    if gains is not None:
+        own[GAINS] = gains.tolist()
     others = {name: value for name, value in meta.extra.items() if name not in own}
     return replace(meta, extra={**others, **own})
 
@@ -182,6 +189,12 @@ def exposure_to_meta(exposure: Exposure | None) -> dict[str, Any]:
     if exposure is None:
         return {}
     return {"exposure": {"matrix": exposure.matrix.tolist(), "offset": exposure.offset.tolist()}}
+
+
+def gains_from_meta(meta: StreamMeta) -> FloatArray | None:
+    """Return by how much cameras had become brighter at a key packet, [C, 3]; None where none had drifted alone."""
+    stored = meta.extra.get(GAINS)
+    return None if stored is None else np.array(stored, np.float32)
 
 
 def exposure_from_meta(meta: StreamMeta) -> Exposure | None:

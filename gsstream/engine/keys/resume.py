@@ -14,7 +14,13 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.names import without_places
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.frame0.begin import decoded_anchors, exposure_from_meta, memory_across_key, shell_behind
+from gsstream.engine.frame0.begin import (
+    decoded_anchors,
+    exposure_from_meta,
+    gains_from_meta,
+    memory_across_key,
+    shell_behind,
+)
 from gsstream.engine.frame0.refine import SHOWN, advance_refinement, is_to_be_refined, start_refinement
 from gsstream.engine.state.stream_state import Refinement, StreamState, next_state
 from gsstream.input.recordings.base import SourceInfo
@@ -124,6 +130,7 @@ def key_state_from_player(assembly: Assembly, player: PlayerState, rng: Rng) -> 
         previous=None,  # type: ignore[arg-type]
         decoders=decoders,
         exposure=exposure_from_meta(player.meta),
+        gains=gains_from_meta(player.meta),
         key_frame=player.frame,
         shell=shell_behind(assembly, player),
         motion_memory=memory_across_key(assembly, player),

@@ -22,7 +22,7 @@ from gsstream.engine.keys.keyframes import key_packet_if_due
 from gsstream.engine.keys.resume import refinement_after, state_after
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.frame_step import frame_step
-from gsstream.engine.step.light import lit_after
+from gsstream.engine.step.light import looked_after
 from gsstream.method.base import StreamingMethod
 from gsstream.method.tools import Tools
 from gsstream.packet import PlayerState
@@ -76,5 +76,6 @@ class PartsMethod(StreamingMethod[StreamState]):
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> StreamState:
         state = replace(state_after(self.slots, tools.since_key(), tools.rng), previous=shown)
-        lit = lit_after(self.slots, state, tools.since_key(), tools)
-        return replace(state, lit=lit, refinement=refinement_after(self.slots, state, tools))
+        looked = looked_after(self.slots, state, tools.since_key(), tools)
+        refinement = refinement_after(self.slots, state, tools)
+        return replace(state, lit=looked.lit, gains=looked.gains, refinement=refinement)

@@ -8,13 +8,17 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 
+from gsstream.core.shapes import FloatArray
 from gsstream.engine.fit.photometric import FrameImages
 from gsstream.parts.render.images import TILE
 
-#: Every so many frames the pictures are looked at, and of these every so many pixels each way, in two grids.
+#: Every so many frames the pictures are looked at, and of these every so many pixels each way, in two grids that begin
+#: at these.
 INTERVAL, STRIDE = 5, 4
+GRIDS = (STRIDE // 4, STRIDE // 4 + STRIDE // 2)
 #: Largest difference of a pixel, levels of 255, in a tile that stood still: noise and light, but nothing that moved.
 STILL = 15.0
 #: Share of the tiles that stood still which must have drifted, and share of all that must have stood still to tell.
@@ -27,45 +31,52 @@ class Lit(NamedTuple):
     Arguments:
         frame: its index.
         pixels: [2, V, h, w, 3] of two grids that share no pixel, as they are stored.
+        gains: [V, 3] by which cameras had become brighter then; None: none had.
     """
 
     frame: int
     pixels: torch.Tensor
+    gains: FloatArray | None = None
 
 
 class Drift(NamedTuple):
-    """The frame that the next one is compared with, and whether the light has drifted away from that frame's."""
+    """What changed slowly.
 
-    lit: Lit | None
+    Arguments:
+        lit: the frame that the next one is compared with.
+        is_due: whether the light has drifted away from that frame's.
+        apart: cameras whose pictures have drifted as those of most cameras have not.
+    """
+
+    lit: Lit
     is_due: bool
+    apart: tuple[int, ...] = ()
 
 
-def looked_at(frame: int, images: FrameImages) -> Lit:
+def looked_at(frame: int, images: FrameImages, gains: FloatArray | None) -> Lit:
     """Return the pixels of a frame that are looked at."""
     grids = []
-    for first in (STRIDE // 4, STRIDE // 4 + STRIDE // 2):
+    for first in GRIDS:
         views = []
         for picture in images.all_stored():
             height, width = (side // STRIDE * STRIDE for side in picture.shape[:2])
             views.append(picture[first:height:STRIDE, first:width:STRIDE])
         grids.append(torch.stack(views))
-    return Lit(frame, torch.stack(grids))
+    return Lit(frame, torch.stack(grids), gains)
 
 
-def drift(lit: Lit | None, now: Lit, levels: float) -> Drift:
-    """Compare the pixels of a frame with those of the frame whose light the colours have; None: with none, yet.
+def drift(lit: Lit, now: Lit, levels: float) -> Drift:
+    """Compare the pixels of a frame with those of the frame whose light the colours have.
 
     Where too little has stood still to tell (a lamp was switched on), what comes next is compared with this frame.
 
     Arguments:
         levels: of 255, by which the mean colour of a tile must differ.
     """
-    if lit is None:
-        return Drift(now, False)
     still, drifted = tile_shares(lit, now, levels)
     if still < ENOUGH:
         return Drift(now, False)
-    return Drift(lit, drifted > DRIFTED)
+    return Drift(lit, drifted > DRIFTED, cameras_apart(lit, now, levels))
 
 
 def tile_shares(before: Lit, now: Lit, levels: float) -> tuple[float, float]:
@@ -74,14 +85,52 @@ def tile_shares(before: Lit, now: Lit, levels: float) -> tuple[float, float]:
     The square of a difference is estimated by the product of those of two grids of pixels, whose noise is independent,
     so that the noise of a camera need not be known: it adds nothing to the mean of the products.
     """
-    whole = 255.0 if now.pixels.is_floating_point() else 1.0
-    difference, side = (now.pixels.float() - before.pixels.float()) * whole, TILE // STRIDE
-    height, width = (size // side for size in difference.shape[2:4])
-    if height * width == 0:
+    tiles = _tiles(changes(before, now)[1])
+    if tiles.numel() == 0:
         return 0.0, 0.0
-    whole_tiles = difference[:, :, : height * side, : width * side]
-    tiles = whole_tiles.reshape(2, -1, height, side, width, side, 3)
     still = (tiles.abs().amax((3, 5, 6)) <= STILL).all(0)
     one, other = tiles.mean((3, 5))
     drifted = ((one * other).mean(-1) > levels**2) & still
     return float(still.float().mean()), float(drifted.sum()) / max(int(still.sum()), 1)
+
+
+def cameras_apart(before: Lit, now: Lit, levels: float) -> tuple[int, ...]:
+    """Return the cameras that got brighter or darker by ``levels`` more than most, in a channel, in most of a picture.
+
+    Of two cameras neither is most. Light that falls on what one of them sees alone is not told apart from its drift
+    here, but by :mod:`gsstream.engine.step.gains`.
+    """
+    first, changed = changes(before, now)
+    if len(first[0]) < 3:
+        return ()
+    level = first.mean((0, 2, 3)).clamp_min(1.0)
+    ratio = ratio_in_most(first, changed)
+    apart = (ratio - ratio.quantile(0.5, 0)) * level
+    return tuple((apart.abs().amax(1) > levels).nonzero()[:, 0].tolist())
+
+
+def ratio_in_most(first: torch.Tensor, changed: torch.Tensor) -> torch.Tensor:
+    """Return [V, 3]: by which share of its brightness each camera's picture changed in the median of its tiles."""
+    bright, change = (_tiles(values).mean((0, 3, 5)).flatten(1, 2) for values in (first, changed))
+    if bright.shape[1] == 0:
+        return bright.new_zeros(len(bright), 3)
+    return (change / bright.clamp_min(1.0)).quantile(0.5, 1)
+
+
+def changes(before: Lit, now: Lit) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return pixels [2, V, h, w, 3] as they were, in levels of 255, and their change but for that of the cameras."""
+    first, then = (lit.pixels.float() * (255.0 if lit.pixels.is_floating_point() else 1.0) for lit in (before, now))
+    # A frame that is looked at twice, or a run in which no camera drifts, is compared to the bit.
+    if now.gains is not before.gains:
+        one = np.ones((then.shape[1], 3), np.float32)
+        was, became = (one if lit.gains is None else lit.gains for lit in (before, now))
+        then = then * torch.from_numpy(was / became).to(then.device)[:, None, None]
+    return first, then - first
+
+
+def _tiles(values: torch.Tensor) -> torch.Tensor:
+    """[2, V, h, w, 3] as tiles [2, V, h / s, s, w / s, s, 3]; what is left beside whole tiles is dropped."""
+    side = TILE // STRIDE
+    height, width = (size // side for size in values.shape[2:4])
+    whole = values[:, :, : height * side, : width * side]
+    return whole.reshape(2, values.shape[1], height, side, width, side, 3)

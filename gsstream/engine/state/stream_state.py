@@ -72,7 +72,9 @@ class StreamState:
     previous: Frame
     #: Linear decoders to continue from; equal to the player's once they were sent.
     decoders: Mapping[str, torch.Tensor] = field(default_factory=dict)
-    exposure: Exposure | None = None  # colour maps of the training cameras, or None
+    exposure: Exposure | None = None  # colour maps of the training cameras in the first frame, or None
+    #: [C, 3] by which each camera has become brighter since, by channel; None: none drifts alone. It is not drawn.
+    gains: FloatArray | None = None
     key_frame: int = 0  # frame of the last key packet
     shell: Shell | None = None  # the sphere behind the scene; None: the recipe asks for none
     #: The first frame as it goes on being optimised beside the stream; None from the key packet on that brings it, and
@@ -92,6 +94,15 @@ class StreamState:
     def shown(self, device: torch.device) -> FrameImages:
         """Return the images that the scene shows, on a device."""
         return FrameImages(self.previous.images, device) if self.resident is None else self.resident.images
+
+    @property
+    def colour_maps(self) -> Exposure | None:
+        """Colour maps of the training cameras as they are now; None: scene colours are what they record."""
+        if self.gains is None:
+            return self.exposure
+        gains = torch.from_numpy(self.gains)
+        first = self.exposure or Exposure.identity(len(gains))
+        return Exposure(gains[:, :, None] * first.matrix, gains * first.offset)
 
     @property
     def gaussians(self) -> Gaussians[torch.Tensor]:

@@ -21,11 +21,15 @@ from gsstream.core.changes import Delta
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.shapes import FloatArray
+from gsstream.core.storage import packed
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.photometric import FrameImages
-from gsstream.engine.state.drift import INTERVAL, Drift, Lit, drift, looked_at
+from gsstream.engine.frame0.begin import gains_from_meta
+from gsstream.engine.frame0.refine import SHOWN
+from gsstream.engine.state.drift import INTERVAL, Lit, drift, looked_at
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.context import EngineContext
+from gsstream.engine.step.gains import camera_offsets, new_gains
 from gsstream.engine.step.light_symbols import with_light
 from gsstream.method.packets import delta_packet
 from gsstream.method.tools import Tools
@@ -46,32 +50,72 @@ def follows_light(assembly: Assembly) -> bool:
     return assembly.recipe.stream.light > 0 and code is not None and code.latent > 0
 
 
-def light_drift(assembly: Assembly, state: StreamState, frame: Frame, images: FrameImages) -> Drift:
-    """Compare a frame with the one whose light the colours have; nothing is due where they do not follow the light."""
+class Looked(NamedTuple):
+    """What a frame that was looked at says.
+
+    Arguments:
+        lit: the frame whose light the colours have.
+        gains: [V, 3] of the cameras; None: none has drifted alone.
+        is_due: whether the colours are to follow the light.
+    """
+
+    lit: Lit | None
+    gains: FloatArray | None
+    is_due: bool = False
+
+
+def look(assembly: Assembly, state: StreamState, frame: Frame, images: FrameImages) -> Looked:
+    """Compare a frame with the one whose light the colours have; nothing is due where they do not follow the light.
+
+    It depends on what players had before the frame, on its pictures, and on what the last look said.
+    """
     if not follows_light(assembly):
-        return Drift(None, False)
-    return drift(state.lit, looked_at(frame.index, images), assembly.recipe.stream.light)
+        return Looked(None, state.gains)
+    lit, gains = state.lit, state.gains
+    if lit is None:
+        lit = looked_at(state.previous.index, state.shown(images.device), gains)
+    if frame.index % INTERVAL:
+        return Looked(lit, gains)
+    now = looked_at(frame.index, images, gains)
+    found = drift(lit, now, assembly.recipe.stream.light)
+    if found.apart:
+        scene = state.gaussians.map(lambda value: value.to(images.device))
+        gains = new_gains(assembly, scene, frame.cameras, before=lit, now=now, apart=found.apart)
+    return Looked(found.lit, gains, found.is_due)
 
 
-def lit_after(assembly: Assembly, state: StreamState, players: Iterable[PlayerState], tools: Tools) -> Lit | None:
-    """Return the frame whose light the colours have, for a stream that is resumed.
+def drift_in_percent(gains: FloatArray) -> list[list[float]]:
+    """Return by how much each camera is brighter than it was, by channel, for the log."""
+    return np.round(100 * (gains.astype(np.float64) - 1), 2).tolist()  # type: ignore[no-any-return]
 
-    The packets say when the colours last followed it; of the frames since, those that are looked at are read again.
+
+def looked_after(assembly: Assembly, state: StreamState, players: Iterable[PlayerState], tools: Tools) -> Looked:
+    """Return what the looks since the last key packet have come to, for a stream that is resumed.
+
+    The packets say when the colours followed the light; the frames that were looked at are read and compared again.
 
     Arguments:
         state: at the end of the stream.
         players: states of players since its last key packet.
     """
+    found = Looked(None, gains_from_meta(state.player.meta))
     if not follows_light(assembly):
-        return None
-    rows = len(state.decoders["sh0"])
-    followed = [player.frame for player in players if _decoder_rows(player) > rows]
-    lit, device = None, assembly.renderer.device
-    first = followed[-1] if followed else state.key_frame + 1
-    for index in range(-(-first // INTERVAL) * INTERVAL, state.player.frame + 1, INTERVAL):
-        now = looked_at(index, FrameImages(tools.recorded(index).as_stored().images, device))
-        lit = drift(lit, now, assembly.recipe.stream.light).lit
-    return lit
+        return found
+    rows, device, before = len(state.decoders["sh0"]), assembly.renderer.device, None
+    for player in players:
+        if before is None:
+            shown = int(player.meta.extra.get(SHOWN, player.frame))
+            images = FrameImages(packed(tools.recorded(shown).as_stored().images), device)
+            found = found._replace(lit=looked_at(shown, images, found.gains))
+        elif player.frame % INTERVAL == 0:
+            frame = tools.recorded(player.frame).as_stored()
+            if frame.epoch_scale:  # a frame that was skipped was not looked at
+                images = FrameImages(frame.images, device)
+                found = look(assembly, replace(state, player=before, lit=found.lit, gains=found.gains), frame, images)
+                if _decoder_rows(player) > rows:
+                    found = found._replace(lit=looked_at(player.frame, images, found.gains))
+        before = player
+    return found
 
 
 def _decoder_rows(player: PlayerState) -> int:
@@ -103,7 +147,6 @@ def relit(assembly: Assembly, state: StreamState, work: EngineContext, sent: Sen
         return sent
     scene = sent.player.gaussians.map(lambda value: torch.from_numpy(value).to(work.gaussians.means.device))
     wanted = wanted_colours(assembly, scene, work)
-    work.log.set(camera_drift=np.round(wanted.cameras.mean(1) * 255, 2).tolist())
     for factor in DEARER:
         delta = with_light(
             sent.delta,
@@ -117,7 +160,8 @@ def relit(assembly: Assembly, state: StreamState, work: EngineContext, sent: Sen
         )
         packet = delta_packet(state.player, delta, frame=sent.player.frame)
         if max_bytes is None or len(packet.data) <= max_bytes:
-            now = sent.lit if delta is sent.delta else looked_at(sent.player.frame, work.images)
+            work.log.set(light_bytes=len(packet.data) - len(sent.packet.data))
+            now = sent.lit if delta is sent.delta else looked_at(sent.player.frame, work.images, state.gains)
             return Sent(delta, packet, decode_packet(state.player, packet.data), now)
     return sent
 
@@ -165,25 +209,3 @@ def wanted_colours(assembly: Assembly, scene: Gaussians[torch.Tensor], work: Eng
     left = asked - weights.T @ cameras
     change = torch.where(total[:, None] > LEAST_LIGHT, left / total.clamp_min(1e-6)[:, None] / SH0, 0.0)
     return Wanted(change.numpy(), (total * SH0**2).numpy(), errors / max(pixels, 1.0), cameras.numpy())
-
-
-def camera_offsets(asked_by_view: torch.Tensor, asked: torch.Tensor, light: torch.Tensor) -> torch.Tensor:
-    """Return [V, 3]: what each camera asks of all colours it sees, beyond what the others ask of the same.
-
-    The least squares of a colour a row and an offset a camera together, with the rows eliminated. All offsets may be
-    larger by the same and all colours smaller: of all solutions the one whose offsets have the median 0, because what
-    most cameras ask for is the light's, and what a few ask for beyond it is their own, however much it is.
-
-    Arguments:
-        asked_by_view, asked: [V, 3], [N, 3] errors, summed over rows and over views, of which each is a sum over pixels
-            by the light that the row gives them.
-        light: [V, N] that light.
-    """
-    light = light.double()
-    shares = light / light.sum(0).clamp_min(1e-6)
-    matrix = light.sum(1).diag() - shares @ light.T
-    right = asked_by_view.double() - shares @ asked.double()
-    inverse: torch.Tensor = torch.linalg.pinv(matrix, rtol=1e-6, hermitian=True)
-    offsets = inverse @ right
-    seen = offsets[light.sum(1) > 0]
-    return (offsets - seen.quantile(0.5, 0)).float() if len(seen) else offsets.float()

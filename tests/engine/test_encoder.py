@@ -263,7 +263,7 @@ def test_going_on_among_skipped_frames_equals_never_having_stopped(tmp_path: Pat
         assert packets(sent) == packets(unbroken)[last + 1 :], f"resumed after frame {last}"
 
 
-def test_going_on_asks_for_the_frame_that_the_scene_shows_and_for_those_whose_light_was_compared(tmp_path: Path) -> None:
+def test_going_on_asks_for_what_the_scene_shows_and_for_what_its_light_was_compared_with(tmp_path: Path) -> None:
     stream, asked = write(tmp_path / "stream.gss", whole("keys")), list[int]()
 
     def image(index: int) -> Frame:

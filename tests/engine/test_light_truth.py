@@ -14,6 +14,7 @@ import torch
 from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.log import FrameLog
 from gsstream.engine.fit.photometric import FrameImages
+from gsstream.engine.state.colour_maps import exposure_with
 from gsstream.engine.state.drift import cameras_apart, looked_at
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.context import EngineContext
@@ -44,7 +45,12 @@ def context(images: np.ndarray, gains: np.ndarray | None = None) -> EngineContex
     work = fit_fixture().work
     player = PlayerState(0, replace(fit_fixture().scene, gaussians=cloud().map(torch.Tensor.numpy)), None)  # type: ignore[arg-type]
     frame = replace(work._frame, images=images, cameras=rig(VIEWS))
-    return EngineContext(work._assembly, StreamState(player, work.hierarchy, frame, gains=gains), frame, FrameLog())
+    return EngineContext(
+        work._assembly,
+        StreamState(player, work.hierarchy, frame, exposure=exposure_with(None, gains)),
+        frame,
+        FrameLog(),
+    )
 
 
 def pictures(shown: Gaussians[torch.Tensor], drift: np.ndarray | float = 0.0) -> np.ndarray:

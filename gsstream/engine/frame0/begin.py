@@ -21,6 +21,13 @@ from gsstream.engine.frame0.first_layer import first_layer_mask
 from gsstream.engine.frame0.optimise import initial_gaussians, optimise_first_frame, sort_by_node
 from gsstream.engine.frame0.rd_quantise import rd_quantise
 from gsstream.engine.frame0.shell import with_shell
+from gsstream.engine.state.colour_maps import (
+    GAINS,
+    exposure_from_meta,
+    exposure_to_meta,
+    exposure_with,
+    gains_from_meta,
+)
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.input.seeds.shell import Shell, find_shell
 from gsstream.input.seeds.thinning import thin_points
@@ -31,8 +38,6 @@ from gsstream.parts.structure.base import Anchors
 
 #: What key packets say of the scene itself, which later ones say, too: colour maps of the cameras, origin of its grid.
 CARRIED = ("exposure", "origin")
-#: Where a key packet says by how much cameras have become brighter.
-GAINS = "gains"
 
 
 def begin(assembly: Assembly, frame: Frame, tools: Tools) -> Step:
@@ -151,7 +156,7 @@ def key_state(
         hierarchy=hierarchy,
         previous=frame,
         decoders=decoders,
-        exposure=exposure_from_meta(player.meta),
+        exposure=exposure_with(exposure_from_meta(player.meta), gains_from_meta(player.meta)),
         gains=gains_from_meta(player.meta),
         key_frame=player.frame,
         shell=shell_behind(assembly, player),
@@ -176,30 +181,12 @@ def shell_behind(assembly: Assembly, player: PlayerState) -> Shell | None:
 def key_meta(
     meta: StreamMeta, exposure: Exposure | None, origin: torch.Tensor, gains: FloatArray | None = None
 ) -> StreamMeta:
-    """Return the description of the run in a key packet, with colour maps, gains and the origin [3] of the grid."""
+    """Return the description of the run in a key packet, with colour maps, gains and the origin [3] of the grid.
+
+    A later key packet's description has the colour maps already: ``exposure`` None leaves it as it is.
+    """
     own = {**exposure_to_meta(exposure), "origin": origin.tolist()}
     if gains is not None:
         own[GAINS] = gains.tolist()
     others = {name: value for name, value in meta.extra.items() if name not in own}
     return replace(meta, extra={**others, **own})
-
-
-def exposure_to_meta(exposure: Exposure | None) -> dict[str, Any]:
-    """Return the colour maps of the training cameras as plain values, for the key packet."""
-    if exposure is None:
-        return {}
-    return {"exposure": {"matrix": exposure.matrix.tolist(), "offset": exposure.offset.tolist()}}
-
-
-def gains_from_meta(meta: StreamMeta) -> FloatArray | None:
-    """Return by how much cameras had become brighter at a key packet, [C, 3]; None where none had drifted alone."""
-    stored = meta.extra.get(GAINS)
-    return None if stored is None else np.array(stored, np.float32)
-
-
-def exposure_from_meta(meta: StreamMeta) -> Exposure | None:
-    """Return the colour maps that a key packet holds; an encoder, resumed or not, goes on from these values."""
-    stored = meta.extra.get("exposure")
-    if stored is None:
-        return None
-    return Exposure(torch.tensor(stored["matrix"]), torch.tensor(stored["offset"]))

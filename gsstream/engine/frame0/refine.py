@@ -27,6 +27,7 @@ from gsstream.engine.fit.densify import DensifyStatistics
 from gsstream.engine.frame0.axes import quat_conjugate
 from gsstream.engine.frame0.optimise import CPU, FirstFrameRun
 from gsstream.engine.frame0.pyramid import one_size
+from gsstream.engine.state.colour_maps import exposure_from_meta
 from gsstream.engine.state.stream_state import Refinement, Step, StreamState
 from gsstream.method.tools import Tools
 from gsstream.packet import PlayerState
@@ -58,8 +59,9 @@ def refine_first_frame(assembly: Assembly, state: StreamState, step: Step, frame
     with tools.log.phase("refine"):
         after, before = step.state, state.refinement
         assert before is not None
+        exposure = exposure_from_meta(state.player.meta)
         found = advance_refinement(
-            assembly, before, state.player, after=after.player, frame=frame, exposure=state.exposure, rng=tools.rng
+            assembly, before, state.player, after=after.player, frame=frame, exposure=exposure, rng=tools.rng
         )
     tools.log.set(refine_iterations=found.iterations - before.iterations)
     return replace(step, state=replace(after, refinement=found))

@@ -15,13 +15,13 @@ from gsstream.core.frame import Frame, PointCloud
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import (
     decoded_anchors,
-    exposure_from_meta,
     key_meta,
     key_state,
     make_layout,
     sort_into_nodes,
 )
 from gsstream.engine.frame0.first_layer import first_layer_mask
+from gsstream.engine.state.colour_maps import exposure_from_meta
 from gsstream.engine.state.stream_state import Step
 from gsstream.method.tools import Tools
 from gsstream.packet import PlayerState, StreamMeta, quantise_key

@@ -76,7 +76,7 @@ def refined_key_step(
     """Return the refined first frame, as it is now, as a key packet, and the state that follows from its bytes."""
     found = state.refinement
     assert found is not None
-    cheaper = rd_quantise(assembly, found.gaussians, frame, exposure=state.colour_maps, rng=rng)
+    cheaper = rd_quantise(assembly, found.gaussians, frame, exposure=state.exposure, rng=rng)
     gaussians = quantise_key(cheaper.map(lambda t: t.numpy())).map(torch.from_numpy)
     return _key_step(
         assembly,
@@ -134,8 +134,8 @@ def _key_step(
     # A resumed run must compare the next frame with the picture that this scene shows, which may be the picture of an
     # older frame.
     meta = replace(meta, extra={**meta.extra, SHOWN: shown})
-    first = first_layer_mask(assembly, gaussians, frame, exposure=state.colour_maps, rng=rng) if layered else None
-    meta = key_meta(meta, state.exposure, anchors.origin, state.gains)
+    first = first_layer_mask(assembly, gaussians, frame, exposure=state.exposure, rng=rng) if layered else None
+    meta = key_meta(meta, None, anchors.origin, state.gains)
     after, packet = key_state(
         assembly, gaussians, layout, hierarchy=hierarchy, frame=frame, meta=meta, rng=rng, first=first, before=before
     )

@@ -14,14 +14,9 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.names import without_places
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.frame0.begin import (
-    decoded_anchors,
-    exposure_from_meta,
-    gains_from_meta,
-    memory_across_key,
-    shell_behind,
-)
+from gsstream.engine.frame0.begin import decoded_anchors, memory_across_key, shell_behind
 from gsstream.engine.frame0.refine import SHOWN, advance_refinement, is_to_be_refined, start_refinement
+from gsstream.engine.state.colour_maps import exposure_from_meta, exposure_with, gains_from_meta
 from gsstream.engine.state.stream_state import Refinement, StreamState, next_state
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.method.tools import Tools
@@ -107,14 +102,14 @@ def refinement_after(assembly: Assembly, state: StreamState, tools: Tools) -> Re
     if not is_to_be_refined(assembly.recipe.stream, state.player):
         return None
     found: Refinement | None = None
-    before = state.player
+    before, exposure = state.player, exposure_from_meta(state.player.meta)
     for player in tools.since_key():
         if found is None:
             found = start_refinement(player)
         else:
             frame = tools.recorded(player.frame)
             found = advance_refinement(
-                assembly, found, before, after=player, frame=frame, exposure=state.exposure, rng=tools.rng
+                assembly, found, before, after=player, frame=frame, exposure=exposure, rng=tools.rng
             )
         before = player
     return found
@@ -129,7 +124,7 @@ def key_state_from_player(assembly: Assembly, player: PlayerState, rng: Rng) -> 
         hierarchy=rebuild_hierarchy(assembly, player),
         previous=None,  # type: ignore[arg-type]
         decoders=decoders,
-        exposure=exposure_from_meta(player.meta),
+        exposure=exposure_with(exposure_from_meta(player.meta), gains_from_meta(player.meta)),
         gains=gains_from_meta(player.meta),
         key_frame=player.frame,
         shell=shell_behind(assembly, player),

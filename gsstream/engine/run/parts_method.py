@@ -76,6 +76,5 @@ class PartsMethod(StreamingMethod[StreamState]):
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> StreamState:
         state = replace(state_after(self.slots, tools.since_key(), tools.rng), previous=shown)
-        looked = looked_after(self.slots, state, tools.since_key(), tools)
-        refinement = refinement_after(self.slots, state, tools)
-        return replace(state, lit=looked.lit, gains=looked.gains, refinement=refinement)
+        state = looked_after(self.slots, state, tools.since_key(), tools)
+        return replace(state, refinement=refinement_after(self.slots, state, tools))

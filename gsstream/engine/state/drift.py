@@ -17,7 +17,7 @@ from gsstream.parts.render.images import TILE
 
 #: Every so many frames the pictures are looked at, and of these every so many pixels each way, in two grids that begin
 #: at these.
-INTERVAL, STRIDE = 5, 4
+EVERY, STRIDE = 5, 4
 GRIDS = (STRIDE // 4, STRIDE // 4 + STRIDE // 2)
 #: Largest difference of a pixel, levels of 255, in a tile that stood still: noise and light, but nothing that moved.
 STILL = 15.0

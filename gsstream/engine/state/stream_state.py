@@ -17,6 +17,7 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.engine.fit.densify import DensifyStatistics
 from gsstream.engine.fit.photometric import FrameImages
+from gsstream.engine.state.colour_maps import exposure_from_meta, exposure_with
 from gsstream.engine.state.drift import Lit
 from gsstream.input.seeds.shell import Shell
 from gsstream.method.base import Step as MethodStep
@@ -72,8 +73,8 @@ class StreamState:
     previous: Frame
     #: Linear decoders to continue from; equal to the player's once they were sent.
     decoders: Mapping[str, torch.Tensor] = field(default_factory=dict)
-    exposure: Exposure | None = None  # colour maps of the training cameras in the first frame, or None
-    #: [C, 3] by which each camera has become brighter since, by channel; None: none drifts alone. It is not drawn.
+    exposure: Exposure | None = None  # colour maps of the training cameras, or None
+    #: [C, 3] by which each camera has become brighter since the first frame; None: none drifts alone.
     gains: FloatArray | None = None
     key_frame: int = 0  # frame of the last key packet
     shell: Shell | None = None  # the sphere behind the scene; None: the recipe asks for none
@@ -95,14 +96,9 @@ class StreamState:
         """Return the images that the scene shows, on a device."""
         return FrameImages(self.previous.images, device) if self.resident is None else self.resident.images
 
-    @property
-    def colour_maps(self) -> Exposure | None:
-        """Colour maps of the training cameras as they are now; None: scene colours are what they record."""
-        if self.gains is None:
-            return self.exposure
-        gains = torch.from_numpy(self.gains)
-        first = self.exposure or Exposure.identity(len(gains))
-        return Exposure(gains[:, :, None] * first.matrix, gains * first.offset)
+    def with_gains(self, gains: FloatArray) -> StreamState:
+        """Return the state with cameras that have become brighter by these gains [C, 3] since the first frame."""
+        return replace(self, gains=gains, exposure=exposure_with(exposure_from_meta(self.player.meta), gains))
 
     @property
     def gaussians(self) -> Gaussians[torch.Tensor]:

@@ -57,8 +57,7 @@ class EngineContext:
         self._background, self._part_scale = assembly.background, part_scale
         self.log = log
         self.key_rows = state.player.key_rows
-        maps = state.colour_maps
-        exposure = None if maps is None else maps.to(device)
+        exposure = None if state.exposure is None else state.exposure.to(device)
         self.images = FrameImages(frame.images, device) if images is None else images
         self.photometric = PhotometricLoss(assembly.renderer.loss, DSSIM, self.images, exposure)
         self._session = state.session

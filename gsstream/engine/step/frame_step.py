@@ -23,9 +23,10 @@ from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.budget.epoch_scheduler import EpochScheduler
 from gsstream.engine.fit.photometric import FrameImages
+from gsstream.engine.state.drift import EVERY
 from gsstream.engine.state.stream_state import Resident, Step, StreamState, next_state, updated
 from gsstream.engine.step.context import EngineContext
-from gsstream.engine.step.light import Sent, drift_in_percent, look, relit
+from gsstream.engine.step.light import Sent, look, relit
 from gsstream.engine.step.metrics import step_numbers
 from gsstream.engine.step.motion import propose_motion
 from gsstream.engine.step.optimise import optimise
@@ -52,11 +53,8 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
     with log.phase("change"):
         images = FrameImages(frame.images, assembly.renderer.device)
         change = find_change(assembly.renderer, state, images, threshold=budget.change_threshold)
-        looked = look(assembly, state, frame, images)
-        if looked.gains is not None and looked.gains is not state.gains:
-            log.set(camera_drift=drift_in_percent(looked.gains))
-        state = replace(state, lit=looked.lit, gains=looked.gains)
-    if change is not None and change.share == 0 and scope is not Scope.ALL and not looked.is_due:
+        state, due = (state, False) if state.lit and frame.index % EVERY else look(assembly, state, frame, images, log)
+    if change is not None and change.share == 0 and scope is not Scope.ALL and not due:
         return empty_step(state, frame, log)
     with log.phase("motion"), deferred_checks(assembly.checks is not Checks.STEP):
         motions, scene, work = propose_motion(assembly, state, frame, change=change, tools=tools, images=images)
@@ -87,8 +85,8 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
     with log.phase("code"):
         trim, most = assembly.recipe.codec.trim, budget.max_bytes
         fitted = encode_frame(delta, state.player, frame.index, solution=solution, trim=trim, max_bytes=most)
-        sent = Sent(fitted.delta, fitted.packet, decode_packet(state.player, fitted.packet.data), looked.lit)
-    if looked.is_due:
+        sent = Sent(fitted.delta, fitted.packet, decode_packet(state.player, fitted.packet.data), state.lit)
+    if due:
         with log.phase("optimise/light"):
             sent = relit(assembly, state, work, sent, max_bytes=most)
     with log.phase("keep"):

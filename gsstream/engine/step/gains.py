@@ -47,15 +47,12 @@ def new_gains(
     # What moved is left out, and a camera whose exposure jumped is not taken for one before which everything moved.
     own = ratio_in_most(first, changed)[:, None, None] * first
     still = ((changed - own).abs().amax(-1, keepdim=True) <= STILL).float()
-    asked = torch.stack([
-        _by_row(assembly, scene, cameras, view=view, pixels=(changed * still, first * still))
-        for view in range(len(cameras))
-    ])  # fmt: skip
+    kept = changed * still, first * still
+    asked = torch.stack([_by_row(assembly, scene, cameras, view=v, pixels=kept) for v in range(len(cameras))])
     errors, lights = asked[:, 0], asked[:, 1].clamp_min(0)
     # A share of the brightness is an offset in a scene whose light is the brightness.
-    found = torch.stack([
-        camera_offsets(errors[..., c].sum(1), errors[..., c].sum(0), lights[..., c]) for c in range(3)
-    ], 1)  # fmt: skip
+    channels = [camera_offsets(errors[..., c].sum(1), errors[..., c].sum(0), lights[..., c]) for c in range(3)]
+    found = torch.stack(channels, 1)
     levels = (found * first.mean((0, 2, 3)).cpu()).abs().amax(1)
     told = [view for view in apart if levels[view] > assembly.recipe.stream.light / 2]
     if not told:

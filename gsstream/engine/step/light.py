@@ -20,13 +20,13 @@ import torch
 from gsstream.core.changes import Delta
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import SH0, Gaussians
+from gsstream.core.log import FrameLog
 from gsstream.core.shapes import FloatArray
 from gsstream.core.storage import packed
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.photometric import FrameImages
-from gsstream.engine.frame0.begin import gains_from_meta
 from gsstream.engine.frame0.refine import SHOWN
-from gsstream.engine.state.drift import INTERVAL, Lit, drift, looked_at
+from gsstream.engine.state.drift import EVERY, Lit, drift, looked_at
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.context import EngineContext
 from gsstream.engine.step.gains import camera_offsets, new_gains
@@ -50,72 +50,55 @@ def follows_light(assembly: Assembly) -> bool:
     return assembly.recipe.stream.light > 0 and code is not None and code.latent > 0
 
 
-class Looked(NamedTuple):
-    """What a frame that was looked at says.
+def look(
+    assembly: Assembly, state: StreamState, frame: Frame, images: FrameImages, log: FrameLog
+) -> tuple[StreamState, bool]:
+    """Compare a frame with the one whose light the colours have: what is known then, and whether they are to follow it.
 
-    Arguments:
-        lit: the frame whose light the colours have.
-        gains: [V, 3] of the cameras; None: none has drifted alone.
-        is_due: whether the colours are to follow the light.
-    """
-
-    lit: Lit | None
-    gains: FloatArray | None
-    is_due: bool = False
-
-
-def look(assembly: Assembly, state: StreamState, frame: Frame, images: FrameImages) -> Looked:
-    """Compare a frame with the one whose light the colours have; nothing is due where they do not follow the light.
-
-    It depends on what players had before the frame, on its pictures, and on what the last look said.
+    It depends on what players had before the frame, on its pictures, and on what the last look said. Nothing is looked
+    at where the recipe follows no light.
     """
     if not follows_light(assembly):
-        return Looked(None, state.gains)
-    lit, gains = state.lit, state.gains
-    if lit is None:
-        lit = looked_at(state.previous.index, state.shown(images.device), gains)
-    if frame.index % INTERVAL:
-        return Looked(lit, gains)
-    now = looked_at(frame.index, images, gains)
+        return state, False
+    lit = state.lit or looked_at(state.previous.index, state.shown(images.device), state.gains)
+    if frame.index % EVERY:
+        return replace(state, lit=lit), False
+    now = looked_at(frame.index, images, state.gains)
     found = drift(lit, now, assembly.recipe.stream.light)
     if found.apart:
         scene = state.gaussians.map(lambda value: value.to(images.device))
         gains = new_gains(assembly, scene, frame.cameras, before=lit, now=now, apart=found.apart)
-    return Looked(found.lit, gains, found.is_due)
+        if gains is not None and gains is not state.gains:
+            log.set(camera_drift=np.round(100 * (gains.astype(np.float64) - 1), 2).tolist())
+            state = state.with_gains(gains)
+    return replace(state, lit=found.lit), found.is_due
 
 
-def drift_in_percent(gains: FloatArray) -> list[list[float]]:
-    """Return by how much each camera is brighter than it was, by channel, for the log."""
-    return np.round(100 * (gains.astype(np.float64) - 1), 2).tolist()  # type: ignore[no-any-return]
-
-
-def looked_after(assembly: Assembly, state: StreamState, players: Iterable[PlayerState], tools: Tools) -> Looked:
-    """Return what the looks since the last key packet have come to, for a stream that is resumed.
+def looked_after(assembly: Assembly, state: StreamState, players: Iterable[PlayerState], tools: Tools) -> StreamState:
+    """Return the state at the end of a stream that is resumed, with what looks since its last key packet have come to.
 
     The packets say when the colours followed the light; the frames that were looked at are read and compared again.
 
     Arguments:
-        state: at the end of the stream.
-        players: states of players since its last key packet.
+        players: their states since the last key packet.
     """
-    found = Looked(None, gains_from_meta(state.player.meta))
     if not follows_light(assembly):
-        return found
-    rows, device, before = len(state.decoders["sh0"]), assembly.renderer.device, None
+        return state
+    found, before = state, None
     for player in players:
         if before is None:
             shown = int(player.meta.extra.get(SHOWN, player.frame))
-            images = FrameImages(packed(tools.recorded(shown).as_stored().images), device)
-            found = found._replace(lit=looked_at(shown, images, found.gains))
-        elif player.frame % INTERVAL == 0:
+            images = FrameImages(packed(tools.recorded(shown).as_stored().images), assembly.renderer.device)
+            found = replace(found, lit=looked_at(shown, images, found.gains))
+        elif player.frame % EVERY == 0:
             frame = tools.recorded(player.frame).as_stored()
             if frame.epoch_scale:  # a frame that was skipped was not looked at
-                images = FrameImages(frame.images, device)
-                found = look(assembly, replace(state, player=before, lit=found.lit, gains=found.gains), frame, images)
-                if _decoder_rows(player) > rows:
-                    found = found._replace(lit=looked_at(player.frame, images, found.gains))
+                images = FrameImages(frame.images, assembly.renderer.device)
+                found, _ = look(assembly, replace(found, player=before), frame, images, FrameLog())
+                if _decoder_rows(player) > len(state.decoders["sh0"]):
+                    found = replace(found, lit=looked_at(player.frame, images, found.gains))
         before = player
-    return found
+    return replace(found, player=state.player)
 
 
 def _decoder_rows(player: PlayerState) -> int:

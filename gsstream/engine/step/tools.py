@@ -13,9 +13,10 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.log import FrameLog
 from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
-from gsstream.engine.frame0.begin import begin, exposure_from_meta, shell_behind
+from gsstream.engine.frame0.begin import begin, shell_behind
 from gsstream.engine.frame0.optimise import Progress
 from gsstream.engine.frame0.reuse import reuse_first_frame
+from gsstream.engine.state.colour_maps import exposure_from_meta
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.context import EngineContext
 from gsstream.method.budget import FrameBudget

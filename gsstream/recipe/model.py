@@ -129,7 +129,8 @@ class Stream(Section):
         ge=0,
         le=100,
         description="grey levels of 255 by which a third of what stands still must have drifted since its colours last "
-        "followed the light; then all colours that stand still are compared with the images. 0: they never are",
+        "followed the light; then all colours that stand still are compared with the images. A camera that drifts so "
+        "far from most others gets a gain of its own. 0: neither",
     )
     refine_frames: int = Field(
         default=0,

@@ -6,6 +6,7 @@ import importlib.util
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -55,6 +56,7 @@ def _write_summary(out: Path, meta: StreamMeta, records: Sequence[FrameRecord]) 
     text = [summary_table({meta.title: summarise(records)}), "", held_out_line(meta)]
     text += ["", later] if (later := later_keys_line(records)) else []
     lines = read_lines(out / METRICS)
+    text += ["", drifted] if (drifted := drift_line(lines, meta.train.ids)) else []
     if lines[0].get("blank_views") == len(meta.train):
         text += [
             "",
@@ -64,6 +66,17 @@ def _write_summary(out: Path, meta: StreamMeta, records: Sequence[FrameRecord]) 
         text += ["", *part] if part else []
     (out / SUMMARY).write_text("\n".join(text) + "\n", encoding="utf-8")
     return out / SUMMARY
+
+
+def drift_line(lines: Sequence[Mapping[str, Any]], cameras: Sequence[str]) -> str:
+    """Return which training cameras drifted alone, and how far by red, green and blue; empty where none did."""
+    told: Sequence[Sequence[float]] = next((line["camera_drift"] for line in lines[::-1] if "camera_drift" in line), [])
+    found = [
+        f"{name} {'/'.join(f'{value:+.1f}' for value in by_channel)} %"
+        for name, by_channel in zip(cameras, told, strict=False)
+        if any(by_channel)
+    ]
+    return f"cameras that became brighter or darker alone: {', '.join(found)}; fix their exposure" if found else ""
 
 
 def write_sheet(out: Path, source: Source, fresh: Mapping[int, Path] = NO_FILES) -> Path:

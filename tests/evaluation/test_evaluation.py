@@ -22,6 +22,7 @@ from gsstream.engine.run.metrics_log import last_written, trim_metrics
 from gsstream.engine.run.progress import frame_line
 from gsstream.evaluation.contact_sheet import Column, contact_sheet, most_changed_window, sheet_of_stream
 from gsstream.evaluation.evaluate import Evaluation, ViewQuality, evaluate
+from gsstream.evaluation.gallery import drift_line
 from gsstream.evaluation.plots import plot_runs
 from gsstream.evaluation.records import FrameRecord, read_lines, read_records
 from gsstream.evaluation.summary import Summary, fitted, format_table, later_keys_line, summarise, summary_table
@@ -201,6 +202,18 @@ def test_there_is_no_drift_across_a_later_key_packet_which_is_listed():
     for key, shown in ((0, "+100.00"), (1, "-"), (3, "-"), (4, "+100.00")):
         rows = replace(whole, later_keys=(key,)).table().splitlines()
         assert [line.split("|")[4].strip() for line in rows[2:4]] == [shown, drift[1]]
+
+
+def test_a_camera_that_drifted_is_named_with_its_last_gain() -> None:
+    """Lines without one are of frames in which no camera got another gain."""
+    lines = [
+        {"frame": 5, "camera_drift": [[0.0, 0.0, 0.0], [-1.0, -1.0, -1.0], [0.0, 0.0, 0.0]]},
+        {"frame": 10, "camera_drift": [[0.0, 0.0, 0.0], [-2.04, -2.0, -2.0], [0.0, 0.0, 0.31]]},
+        {"frame": 11},
+    ]
+    wanted = "cameras that became brighter or darker alone: b -2.0/-2.0/-2.0 %, c +0.0/+0.0/+0.3 %; fix their exposure"
+    assert drift_line(lines, ["a", "b", "c"]) == wanted
+    assert drift_line(lines[2:], ["a", "b", "c"]) == ""
 
 
 def test_what_was_not_measured_is_a_dash():

@@ -108,6 +108,9 @@ def test_a_camera_that_drifts_alone_is_told_and_takes_nothing_of_the_test_camera
         np.testing.assert_allclose(percent[2], -0.5 * frame, atol=0.3)
         assert not np.delete(percent, 2, 0).any()
     assert not any("camera_drift" in line for line in metrics(alone))
+    named = "alone: cam02 -12.5/-12.5/-12.5 %"
+    assert scene == "dim" or named in (drifts / "summary.txt").read_text()
+    assert "alone" not in (alone / "summary.txt").read_text()
     assert quality(drifts, slice(16, 26)) > quality(alone, slice(16, 26)) - 0.1
 
 

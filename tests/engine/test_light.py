@@ -117,11 +117,29 @@ def test_of_pictures_without_a_tile_no_camera_is_apart(size: tuple[int, int]) ->
     assert cameras_apart(pixels(before), pixels(now), levels=1) == ()
 
 
-def test_a_black_picture_has_no_gain_that_is_not_finite() -> None:
+@pytest.mark.parametrize("shown", ["black", "white", "grey", "another place", "noise"])
+@pytest.mark.parametrize("before_black", [False, True])
+def test_a_camera_that_shows_something_else_is_not_apart(shown: str, before_black: bool) -> None:
+    """A cable that fell out, a hand before the lens: no gain brings that back. Nor is one found when it ends."""
+    place = rig_pictures([1.0] * 4, seed=1)
+    other = place.copy()
+    other[2] = {
+        "black": np.float32(0),
+        "white": np.float32(1),
+        "grey": np.float32(0.2),
+        "another place": 0.4 * rig_pictures([1.0], noise=30, seed=5)[0][::-1, ::-1],
+        "noise": np.random.default_rng(3).uniform(0, 0.2, place.shape[1:]).astype(np.float32),
+    }[shown]
+    before, now = (other, place) if before_black else (place, other)
+    assert cameras_apart(pixels(before), pixels(now), levels=1) == ()
+
+
+def test_of_a_rig_in_the_dark_no_camera_is_apart() -> None:
     before = np.zeros((4, 32, 32, 3), np.float32)
     now = before.copy()
     now[3] = 0.02
-    assert cameras_apart(pixels(before), pixels(now), levels=1) == (3,)
+    assert cameras_apart(pixels(before), pixels(before), levels=1) == ()
+    assert cameras_apart(pixels(before), pixels(now), levels=1) == ()
 
 
 def test_no_pass_is_due_in_the_demo_whatever_frames_are_compared() -> None:

@@ -23,6 +23,8 @@ GRIDS = (STRIDE // 4, STRIDE // 4 + STRIDE // 2)
 STILL = 15.0
 #: Share of the tiles that stood still which must have drifted, and share of all that must have stood still to tell.
 DRIFTED, ENOUGH = 1 / 3, 1 / 4
+#: Correlation with the picture before from which a camera still shows the same.
+ALIKE = 0.7
 
 
 class Lit(NamedTuple):
@@ -97,24 +99,37 @@ def tile_shares(before: Lit, now: Lit, levels: float) -> tuple[float, float]:
 def cameras_apart(before: Lit, now: Lit, levels: float) -> tuple[int, ...]:
     """Return the cameras that got brighter or darker by ``levels`` more than most, in a channel, in most of a picture.
 
-    Of two cameras neither is most. Light that falls on what one of them sees alone is not told apart from its drift
-    here, but by :mod:`gsstream.engine.step.gains`.
+    A camera that shows something else than before (somebody stands before it, or it went black) is not among them. Of
+    two cameras neither is most. Light that falls on what one of them sees alone is not told apart from its drift here,
+    but by :mod:`gsstream.engine.step.gains`.
     """
     first, changed = changes(before, now)
     if len(first[0]) < 3:
         return ()
     level = first.mean((0, 2, 3)).clamp_min(1.0)
     ratio = ratio_in_most(first, changed)
-    apart = (ratio - ratio.quantile(0.5, 0)) * level
-    return tuple((apart.abs().amax(1) > levels).nonzero()[:, 0].tolist())
+    apart = ((ratio - ratio.quantile(0.5, 0)) * level).abs().amax(1) > levels
+    return tuple((apart & (_likeness(first, first + changed) > ALIKE)).nonzero()[:, 0].tolist())
 
 
 def ratio_in_most(first: torch.Tensor, changed: torch.Tensor) -> torch.Tensor:
     """Return [V, 3]: by which share of its brightness each camera's picture changed in the median of its tiles."""
-    bright, change = (_tiles(values).mean((0, 3, 5)).flatten(1, 2) for values in (first, changed))
+    bright, change = _tile_means(first), _tile_means(changed)
     if bright.shape[1] == 0:
         return bright.new_zeros(len(bright), 3)
     return (change / bright.clamp_min(1.0)).quantile(0.5, 1)
+
+
+def _likeness(first: torch.Tensor, then: torch.Tensor) -> torch.Tensor:
+    """Return [V] correlations of the brightness of pixels; 0 where all are as bright."""
+    pixels = (values.mean(4).transpose(0, 1).flatten(1) for values in (first, then))
+    one, other = (values - values.mean(1, keepdim=True) for values in pixels)
+    return (one * other).sum(1) / (one.square().sum(1) * other.square().sum(1)).sqrt().clamp_min(1e-3)
+
+
+def _tile_means(values: torch.Tensor) -> torch.Tensor:
+    """[V, T, 3] means of pixels [2, V, h, w, 3] over both grids and tiles."""
+    return _tiles(values).mean((0, 3, 5)).flatten(1, 2)
 
 
 def changes(before: Lit, now: Lit) -> tuple[torch.Tensor, torch.Tensor]:

@@ -170,6 +170,14 @@ def test_a_gain_goes_on_from_what_is_known() -> None:
     assert (np.delete(found, 2, 0) == 1).all()
 
 
+@pytest.mark.parametrize(("known", "gain"), [(0.2, 0.1), (5.0, 10.0), (0.125, 0.06)])
+def test_a_camera_that_fades_away_keeps_the_gain_it_had(known: float, gain: float) -> None:
+    """Beyond an eighth and eight times nothing is left of a picture but noise."""
+    gains = np.ones((VIEWS, 3), np.float32)
+    gains[2] = known
+    assert np.array_equal(gains_after(gained(cloud(), {2: gain}), known=gains), gains)
+
+
 def test_a_frame_is_fitted_in_the_colours_that_a_camera_has_now() -> None:
     """The scene as it is explains the picture of a camera that has lost a tenth; without the gain it does not."""
     images = gained(cloud(), {2: 0.9})

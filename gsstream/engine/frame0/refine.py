@@ -59,6 +59,7 @@ def refine_first_frame(assembly: Assembly, state: StreamState, step: Step, frame
     with tools.log.phase("refine"):
         after, before = step.state, state.refinement
         assert before is not None
+        # Of cameras as they were at first, whatever they have drifted in so few frames: a resumed run makes it again.
         exposure = exposure_from_meta(state.player.meta)
         found = advance_refinement(
             assembly, before, state.player, after=after.player, frame=frame, exposure=exposure, rng=tools.rng

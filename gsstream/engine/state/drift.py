@@ -135,7 +135,7 @@ def _tile_means(values: torch.Tensor) -> torch.Tensor:
 def changes(before: Lit, now: Lit) -> tuple[torch.Tensor, torch.Tensor]:
     """Return pixels [2, V, h, w, 3] as they were, in levels of 255, and their change but for that of the cameras."""
     first, then = (lit.pixels.float() * (255.0 if lit.pixels.is_floating_point() else 1.0) for lit in (before, now))
-    # A frame that is looked at twice, or a run in which no camera drifts, is compared to the bit.
+    # Where no camera drifts, pictures are compared as they are stored, to the bit.
     if now.gains is not before.gains:
         one = np.ones((then.shape[1], 3), np.float32)
         was, became = (one if lit.gains is None else lit.gains for lit in (before, now))

@@ -19,8 +19,10 @@ from gsstream.core.shapes import FloatArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.state.drift import GRIDS, STILL, STRIDE, Lit, changes, ratio_in_most
 
-#: Digits to which a gain is known: a resumed run finds the same.
+#: Digits to which a gain is known, so that no rounding decides what a resumed run goes on from.
 DIGITS = 4
+#: Least and largest gain: beyond them a camera is broken, and nothing is made of its noise.
+LEAST, MOST = 1 / 8, 8.0
 
 
 def new_gains(
@@ -54,12 +56,14 @@ def new_gains(
     channels = [camera_offsets(errors[..., c].sum(1), errors[..., c].sum(0), lights[..., c]) for c in range(3)]
     found = torch.stack(channels, 1)
     levels = (found * first.mean((0, 2, 3)).cpu()).abs().amax(1)
-    told = [view for view in apart if levels[view] > assembly.recipe.stream.light / 2]
+    gains = np.ones((len(cameras), 3), np.float32) if now.gains is None else now.gains.copy()
+    after = (gains * (1 + found.numpy())).round(DIGITS)
+    enough, sound = levels.numpy() > assembly.recipe.stream.light / 2, ((after >= LEAST) & (after <= MOST)).all(1)
+    told = [view for view in apart if enough[view] and sound[view]]
     if not told:
         return now.gains
-    gains = np.ones((len(cameras), 3), np.float32) if now.gains is None else now.gains.copy()
-    gains[told] *= 1 + found[told].numpy()
-    return gains.round(DIGITS)
+    gains[told] = after[told]
+    return gains
 
 
 def _by_row(

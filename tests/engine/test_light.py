@@ -10,7 +10,7 @@ from gsstream.core.changes import Delta, Layout, Residual, Scene, apply_delta, s
 from gsstream.core.gaussians import SH0
 from gsstream.encode import open_recording
 from gsstream.engine.fit.photometric import FrameImages
-from gsstream.engine.state.drift import Lit, cameras_apart, drift, looked_at, tile_shares
+from gsstream.engine.state.drift import Lit, cameras_apart, changes, drift, looked_at, tile_shares
 from gsstream.engine.step.gains import camera_offsets
 from gsstream.engine.step.light_symbols import STEP, light_symbols, with_light
 from gsstream.packet import quantise_decoders
@@ -35,7 +35,7 @@ def test_noise_is_no_drift_and_two_levels_of_light_are(stored: str, change: floa
     """The noise of a pixel is as large as the change; that of the mean of a grid's 16 pixels is half a level."""
     rng = np.random.default_rng(1)
     before, now = (pixels(pictures(rng, by, noise=2), stored) for by in (0, change))
-    still, drifted = tile_shares(before, now, levels=1)
+    still, drifted = tile_shares(changes(before, now), levels=1)
     assert still == 1.0
     assert drifted == pytest.approx(share, abs=0.1)
 
@@ -45,14 +45,14 @@ def test_what_moved_is_not_asked_about_the_light() -> None:
     rng = np.random.default_rng(2)
     before, now = pictures(rng), pictures(rng, 2)
     now[:, :, :48] = pictures(rng, seed=9)[:, :, :48]
-    assert tile_shares(pixels(before), pixels(now), levels=1) == pytest.approx((2 / 5, 1.0))
+    assert tile_shares(changes(pixels(before), pixels(now)), levels=1) == pytest.approx((2 / 5, 1.0))
 
 
 @pytest.mark.parametrize("size", [(3, 5), (15, 40), (16, 16)])
 def test_small_pictures_have_few_tiles_or_none(size: tuple[int, int]) -> None:
     before, now = np.zeros((1, *size, 3), np.float32), np.full((1, *size, 3), 4 / 255, np.float32)
     wanted = (1.0, 1.0) if size == (16, 16) else (0.0, 0.0)
-    assert tile_shares(pixels(before), pixels(now), levels=1) == wanted
+    assert tile_shares(changes(pixels(before), pixels(now)), levels=1) == wanted
 
 
 @pytest.mark.parametrize(("change", "due", "frame"), [(0.4, False, 0), (2.0, True, 0), (80.0, False, 5)])
@@ -89,7 +89,7 @@ def test_a_camera_leaves_the_others_by_a_level_of_what_they_do(
 ) -> None:
     """Light that all see alike is none of a camera's; of two cameras neither is most."""
     before = pixels(rig_pictures([1.0] * len(ratios), seed=1), stored)
-    assert cameras_apart(before, pixels(rig_pictures(ratios, seed=2), stored), levels=1) == apart
+    assert cameras_apart(changes(before, pixels(rig_pictures(ratios, seed=2), stored)), levels=1) == apart
 
 
 @pytest.mark.parametrize("storage", [("uint8", "float32"), ("float32", "uint8")])
@@ -98,23 +98,23 @@ def test_a_gain_that_is_known_is_no_change(storage: tuple[str, str]) -> None:
     first, then = rig_pictures([1.0, 1.0, 1.0], noise=0), rig_pictures([1.0, 0.8, 1.0], noise=0)
     gains = np.array([[1, 1, 1], [0.8, 0.8, 0.8], [1, 1, 1]], np.float32)
     before, now = pixels(first, storage[0]), pixels(then, storage[1], frame=5, gains=gains)
-    assert cameras_apart(before, now, levels=1) == ()
-    assert tile_shares(before, now, levels=1) == (1.0, 0.0)
-    assert tile_shares(now, before, levels=1) == (1.0, 0.0)
-    assert cameras_apart(now._replace(gains=None), before, levels=1) == (1,)
+    assert cameras_apart(changes(before, now), levels=1) == ()
+    assert tile_shares(changes(before, now), levels=1) == (1.0, 0.0)
+    assert tile_shares(changes(now, before), levels=1) == (1.0, 0.0)
+    assert cameras_apart(changes(now._replace(gains=None), before), levels=1) == (1,)
 
 
 def test_a_camera_before_which_half_a_picture_moves_is_not_apart() -> None:
     before, now = rig_pictures([1.0] * 4, seed=1), rig_pictures([1.0] * 4, seed=2)
     now[2, :, :32] = 0.9
-    assert cameras_apart(pixels(before), pixels(now), levels=1) == ()
+    assert cameras_apart(changes(pixels(before), pixels(now)), levels=1) == ()
 
 
 @pytest.mark.parametrize("size", [(3, 5), (15, 40)])
 def test_of_pictures_without_a_tile_no_camera_is_apart(size: tuple[int, int]) -> None:
     before, now = np.zeros((4, *size, 3), np.float32), np.zeros((4, *size, 3), np.float32)
     now[1] = 0.5
-    assert cameras_apart(pixels(before), pixels(now), levels=1) == ()
+    assert cameras_apart(changes(pixels(before), pixels(now)), levels=1) == ()
 
 
 @pytest.mark.parametrize("shown", ["black", "white", "grey", "another place", "noise"])
@@ -131,15 +131,15 @@ def test_a_camera_that_shows_something_else_is_not_apart(shown: str, before_blac
         "noise": np.random.default_rng(3).uniform(0, 0.2, place.shape[1:]).astype(np.float32),
     }[shown]
     before, now = (other, place) if before_black else (place, other)
-    assert cameras_apart(pixels(before), pixels(now), levels=1) == ()
+    assert cameras_apart(changes(pixels(before), pixels(now)), levels=1) == ()
 
 
 def test_of_a_rig_in_the_dark_no_camera_is_apart() -> None:
     before = np.zeros((4, 32, 32, 3), np.float32)
     now = before.copy()
     now[3] = 0.02
-    assert cameras_apart(pixels(before), pixels(before), levels=1) == ()
-    assert cameras_apart(pixels(before), pixels(now), levels=1) == ()
+    assert cameras_apart(changes(pixels(before), pixels(before)), levels=1) == ()
+    assert cameras_apart(changes(pixels(before), pixels(now)), levels=1) == ()
 
 
 def test_no_pass_is_due_in_the_demo_whatever_frames_are_compared() -> None:

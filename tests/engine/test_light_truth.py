@@ -15,7 +15,7 @@ from gsstream.core.gaussians import SH0, Gaussians
 from gsstream.core.log import FrameLog
 from gsstream.engine.fit.photometric import FrameImages
 from gsstream.engine.state.colour_maps import exposure_with
-from gsstream.engine.state.drift import cameras_apart, looked_at
+from gsstream.engine.state.drift import cameras_apart, changes, looked_at
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.context import EngineContext
 from gsstream.engine.step.gains import new_gains
@@ -125,7 +125,7 @@ def gains_after(images: np.ndarray, before: np.ndarray | None = None, known: np.
     work = context(images)
     lit = looked_at(0, FrameImages(pictures(cloud()) if before is None else before, torch.device("cpu")), None)
     now = looked_at(5, FrameImages(images, torch.device("cpu")), known)
-    apart = cameras_apart(lit, now, levels=1)
+    apart = cameras_apart(changes(lit, now), levels=1)
     found = new_gains(work._assembly, work.gaussians, rig(VIEWS), before=lit, now=now, apart=apart)
     return np.ones((VIEWS, 3), np.float32) if found is None else found
 

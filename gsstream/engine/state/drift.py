@@ -67,6 +67,24 @@ def looked_at(frame: int, images: FrameImages, gains: FloatArray | None) -> Lit:
     return Lit(frame, torch.stack(grids), gains)
 
 
+class Changes(NamedTuple):
+    """Pixels [2, V, h, w, 3] as they were, levels of 255, and their change but for that of the cameras' gains."""
+
+    first: torch.Tensor
+    changed: torch.Tensor
+
+
+def changes(before: Lit, now: Lit) -> Changes:
+    """Compare the pixels of two frames."""
+    first, then = (lit.pixels.float() * (255.0 if lit.pixels.is_floating_point() else 1.0) for lit in (before, now))
+    # Where no camera drifts, pictures are compared as they are stored, to the bit.
+    if now.gains is not before.gains:
+        one = np.ones((then.shape[1], 3), np.float32)
+        was, became = (one if lit.gains is None else lit.gains for lit in (before, now))
+        then = then * torch.from_numpy(was / became).to(then.device)[:, None, None]
+    return Changes(first, then - first)
+
+
 def drift(lit: Lit, now: Lit, levels: float) -> Drift:
     """Compare the pixels of a frame with those of the frame whose light the colours have.
 
@@ -75,19 +93,20 @@ def drift(lit: Lit, now: Lit, levels: float) -> Drift:
     Arguments:
         levels: of 255, by which the mean colour of a tile must differ.
     """
-    still, drifted = tile_shares(lit, now, levels)
+    found = changes(lit, now)
+    still, drifted = tile_shares(found, levels)
     if still < ENOUGH:
         return Drift(now, False)
-    return Drift(lit, drifted > DRIFTED, cameras_apart(lit, now, levels))
+    return Drift(lit, drifted > DRIFTED, cameras_apart(found, levels))
 
 
-def tile_shares(before: Lit, now: Lit, levels: float) -> tuple[float, float]:
+def tile_shares(pixels: Changes, levels: float) -> tuple[float, float]:
     """Return the share of the tiles that stood still, and of these the share whose mean colour differs by ``levels``.
 
     The square of a difference is estimated by the product of those of two grids of pixels, whose noise is independent,
     so that the noise of a camera need not be known: it adds nothing to the mean of the products.
     """
-    tiles = _tiles(changes(before, now)[1])
+    tiles = _tiles(pixels.changed)
     if tiles.numel() == 0:
         return 0.0, 0.0
     still = (tiles.abs().amax((3, 5, 6)) <= STILL).all(0)
@@ -96,25 +115,27 @@ def tile_shares(before: Lit, now: Lit, levels: float) -> tuple[float, float]:
     return float(still.float().mean()), float(drifted.sum()) / max(int(still.sum()), 1)
 
 
-def cameras_apart(before: Lit, now: Lit, levels: float) -> tuple[int, ...]:
+def cameras_apart(pixels: Changes, levels: float) -> tuple[int, ...]:
     """Return the cameras that got brighter or darker by ``levels`` more than most, in a channel, in most of a picture.
 
     A camera that shows something else than before (somebody stands before it, or it went black) is not among them. Of
     two cameras neither is most. Light that falls on what one of them sees alone is not told apart from its drift here,
     but by :mod:`gsstream.engine.step.gains`.
     """
-    first, changed = changes(before, now)
-    if len(first[0]) < 3:
+    first = pixels.first
+    if first.shape[1] < 3:
         return ()
     level = first.mean((0, 2, 3)).clamp_min(1.0)
-    ratio = ratio_in_most(first, changed)
+    ratio = ratio_in_most(pixels)
     apart = ((ratio - ratio.quantile(0.5, 0)) * level).abs().amax(1) > levels
-    return tuple((apart & (_likeness(first, first + changed) > ALIKE)).nonzero()[:, 0].tolist())
+    if not apart.any():
+        return ()
+    return tuple((apart & (_likeness(first, first + pixels.changed) > ALIKE)).nonzero()[:, 0].tolist())
 
 
-def ratio_in_most(first: torch.Tensor, changed: torch.Tensor) -> torch.Tensor:
+def ratio_in_most(pixels: Changes) -> torch.Tensor:
     """Return [V, 3]: by which share of its brightness each camera's picture changed in the median of its tiles."""
-    bright, change = _tile_means(first), _tile_means(changed)
+    bright, change = (_tiles(values).mean((0, 3, 5)).flatten(1, 2) for values in pixels)
     if bright.shape[1] == 0:
         return bright.new_zeros(len(bright), 3)
     return (change / bright.clamp_min(1.0)).quantile(0.5, 1)
@@ -125,22 +146,6 @@ def _likeness(first: torch.Tensor, then: torch.Tensor) -> torch.Tensor:
     pixels = (values.mean(4).transpose(0, 1).flatten(1) for values in (first, then))
     one, other = (values - values.mean(1, keepdim=True) for values in pixels)
     return (one * other).sum(1) / (one.square().sum(1) * other.square().sum(1)).sqrt().clamp_min(1e-3)
-
-
-def _tile_means(values: torch.Tensor) -> torch.Tensor:
-    """[V, T, 3] means of pixels [2, V, h, w, 3] over both grids and tiles."""
-    return _tiles(values).mean((0, 3, 5)).flatten(1, 2)
-
-
-def changes(before: Lit, now: Lit) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return pixels [2, V, h, w, 3] as they were, in levels of 255, and their change but for that of the cameras."""
-    first, then = (lit.pixels.float() * (255.0 if lit.pixels.is_floating_point() else 1.0) for lit in (before, now))
-    # Where no camera drifts, pictures are compared as they are stored, to the bit.
-    if now.gains is not before.gains:
-        one = np.ones((then.shape[1], 3), np.float32)
-        was, became = (one if lit.gains is None else lit.gains for lit in (before, now))
-        then = then * torch.from_numpy(was / became).to(then.device)[:, None, None]
-    return first, then - first
 
 
 def _tiles(values: torch.Tensor) -> torch.Tensor:

@@ -45,9 +45,10 @@ def new_gains(
         before, now: pixels of an earlier frame and of this one, each with the gains of its time.
         apart: cameras that may get another gain.
     """
-    first, changed = changes(before, now)
+    pixels = changes(before, now)
+    first, changed = pixels
     # What moved is left out, and a camera whose exposure jumped is not taken for one before which everything moved.
-    own = ratio_in_most(first, changed)[:, None, None] * first
+    own = ratio_in_most(pixels)[:, None, None] * first
     still = ((changed - own).abs().amax(-1, keepdim=True) <= STILL).float()
     kept = changed * still, first * still
     asked = torch.stack([_by_row(assembly, scene, cameras, view=v, pixels=kept) for v in range(len(cameras))])

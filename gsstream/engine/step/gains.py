@@ -8,6 +8,7 @@ looks like to this camera, is reported, and is never drawn.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +22,8 @@ from gsstream.engine.state.drift import GRIDS, STILL, STRIDE, Lit, changes, rati
 
 #: Digits to which a gain is known, so that no rounding decides what a resumed run goes on from.
 DIGITS = 4
+#: Levels of 255 from which a camera has drifted, and not only its noise.
+TOLD = 0.1
 #: Least and largest gain: beyond them a camera is broken, and nothing is made of its noise.
 LEAST, MOST = 1 / 8, 8.0
 
@@ -32,7 +35,7 @@ def new_gains(
     *,
     before: Lit,
     now: Lit,
-    apart: tuple[int, ...],
+    apart: Sequence[int],
 ) -> FloatArray | None:
     """Return the gains [V, 3] of all cameras, of which those that drift alone have new ones.
 
@@ -45,6 +48,8 @@ def new_gains(
         before, now: pixels of an earlier frame and of this one, each with the gains of its time.
         apart: cameras that may get another gain.
     """
+    if len(cameras) < 3:  # of two neither is most
+        return now.gains
     pixels = changes(before, now)
     first, changed = pixels
     # What moved is left out, and a camera whose exposure jumped is not taken for one before which everything moved.
@@ -59,7 +64,7 @@ def new_gains(
     levels = (found * first.mean((0, 2, 3)).cpu()).abs().amax(1)
     gains = np.ones((len(cameras), 3), np.float32) if now.gains is None else now.gains.copy()
     after = (gains * (1 + found.numpy())).round(DIGITS)
-    enough, sound = levels.numpy() > assembly.recipe.stream.light / 2, ((after >= LEAST) & (after <= MOST)).all(1)
+    enough, sound = levels.numpy() > TOLD, ((after >= LEAST) & (after <= MOST)).all(1)
     told = [view for view in apart if enough[view] and sound[view]]
     if not told:
         return now.gains

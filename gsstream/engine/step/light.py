@@ -65,9 +65,10 @@ def look(
         return replace(state, lit=lit), False
     now = looked_at(frame.index, images, state.gains)
     found = drift(lit, now, assembly.recipe.stream.light)
-    if found.apart:
+    # Before the colours follow the light, and the next frames are compared with this one, all cameras are asked.
+    if apart := range(len(frame.cameras)) if found.is_due else found.apart:
         scene = state.gaussians.map(lambda value: value.to(images.device))
-        gains = new_gains(assembly, scene, frame.cameras, before=lit, now=now, apart=found.apart)
+        gains = new_gains(assembly, scene, frame.cameras, before=lit, now=now, apart=apart)
         if gains is not None and gains is not state.gains:
             log.set(camera_drift=np.round(100 * (gains.astype(np.float64) - 1), 2).tolist())
             state = state.with_gains(gains)

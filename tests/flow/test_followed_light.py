@@ -114,6 +114,15 @@ def test_a_camera_that_drifts_alone_is_told_and_takes_nothing_of_the_test_camera
     assert quality(drifts, slice(16, 26)) > quality(alone, slice(16, 26)) - 0.1
 
 
+def test_a_drift_that_is_slower_than_the_light_adds_up(rooms: Rooms) -> None:
+    """The frame that pictures are compared with is another one each time the colours follow the light."""
+    out = rooms.run("dim", around="disturbed:drift=cam02@-0.001:")
+    assert len(followed(out)) > 3
+    *_, told = [line["camera_drift"] for line in metrics(out) if "camera_drift" in line]
+    np.testing.assert_allclose(told[2], -2.5, atol=0.4)
+    assert np.abs(np.delete(told, 2, 0)).max() < 0.4
+
+
 def test_a_camera_that_drifts_takes_nothing_of_a_room_in_which_nothing_moves(rooms: Rooms) -> None:
     """What changes in its pictures is seen now and then, and asked of few Gaussians."""
     stays, drifts = rooms.run("paths&static=1"), rooms.run("paths&static=1", around="disturbed:drift=cam02@-0.01:")

@@ -2,8 +2,9 @@
 
 A camera's exposure and its white balance may drift, as automatic ones do. What moves is fitted to all cameras alike, so
 that one of them drags it along. A gain for each camera and channel goes on from frame to frame: it is found in closed
-form where :func:`~gsstream.engine.state.drift.cameras_apart` saw a camera leave the others, multiplies what the scene
-looks like to this camera, is reported, and is never drawn.
+form where :func:`~gsstream.engine.state.drift.cameras_apart` saw a camera leave the others, and for all cameras
+wherever the colours follow the light. It multiplies what the scene looks like to this camera, is reported, and is never
+drawn.
 """
 
 from __future__ import annotations

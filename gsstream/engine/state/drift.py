@@ -76,7 +76,10 @@ class Changes(NamedTuple):
 
 def changes(before: Lit, now: Lit) -> Changes:
     """Compare the pixels of two frames."""
-    first, then = (lit.pixels.float() * (255.0 if lit.pixels.is_floating_point() else 1.0) for lit in (before, now))
+    device = now.pixels.device
+    first, then = (
+        lit.pixels.to(device).float() * (255.0 if lit.pixels.is_floating_point() else 1.0) for lit in (before, now)
+    )
     # Where no camera drifts, pictures are compared as they are stored, to the bit.
     if now.gains is not before.gains:
         one = np.ones((then.shape[1], 3), np.float32)

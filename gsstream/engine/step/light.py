@@ -60,7 +60,10 @@ def look(
     """
     if not follows_light(assembly):
         return state, False
-    lit = state.lit or looked_at(state.previous.index, state.shown(images.device), state.gains)
+    # From where the pictures are: the device gets the pixels that are compared, and only when they are.
+    lit = state.lit or looked_at(
+        state.previous.index, FrameImages(state.previous.images, torch.device("cpu")), state.gains
+    )
     if frame.index % EVERY:
         return replace(state, lit=lit), False
     now = looked_at(frame.index, images, state.gains)

@@ -203,9 +203,15 @@ export class PlayerElement extends HTMLElement {
   async _statistics() {
     this.parts.facts.hidden = !this.parts.facts.hidden;
     this.parts.statistics.ariaPressed = String(!this.parts.facts.hidden);
-    const module = await import("./statistics.js").catch(() => this._tell(LOST));
+    const module = await import("./statistics.js").catch(() => this._lost());
     this.facts ??= module && new module.Statistics(this.player);
     this._everySecond();
+  }
+
+  /** Say that a module did not come; a first picture that comes later takes no notice away. */
+  _lost() {
+    this.notice = LOST;
+    this._tell(LOST);
   }
 
   /** A button for a headset only where there is one, or where only https is missing to whoever asks for it. */
@@ -216,7 +222,7 @@ export class PlayerElement extends HTMLElement {
   }
 
   async _headset() {
-    const module = await import("./xr.js").catch(() => this._tell(LOST));
+    const module = await import("./xr.js").catch(() => this._lost());
     this.headset = module && new module.Headset(this.player);
     await this.headset?.enter().catch((error) => this._tell(error.message));
   }

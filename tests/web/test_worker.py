@@ -100,9 +100,13 @@ def test_a_module_that_does_not_come_is_done_without_or_told(site, tmp_path, req
 
 
 def test_a_part_that_only_some_ask_for_is_told_where_it_does_not_come(site, tmp_path):
-    steps = [["go", "URL/index.html"], READY, ["evaluate", f"{ROOT}.querySelector('.statistics').click()"]]
+    """Also to whoever asks before the first picture is drawn, which takes away what was said of loading."""
+    click, told = f"{ROOT}.querySelector('.statistics').click()", f"{MESSAGE}.startsWith('A part of the player')"
+    drawn = f"{PLAYER}.dispatchEvent(new Event('drawn'))"
+    steps = [["go", "URL/index.html"], READY, ["evaluate", click], ["until", told], ["evaluate", drawn]]
     with serving(site, lost=["statistics.js", 99]) as (url, _):
-        in_browser(at(url, [*steps, ["until", f"{MESSAGE}.startsWith('A part of the player')"]]), tmp_path)
+        *_, still = in_browser(at(url, [*steps, ["evaluate", told]]), tmp_path)
+    assert still
 
 
 def test_a_manifest_that_is_not_answered_is_asked_for_again(site, tmp_path):

@@ -21,13 +21,7 @@ from gsstream.engine.frame0.first_layer import first_layer_mask
 from gsstream.engine.frame0.optimise import initial_gaussians, optimise_first_frame, sort_by_node
 from gsstream.engine.frame0.rd_quantise import rd_quantise
 from gsstream.engine.frame0.shell import with_shell
-from gsstream.engine.state.colour_maps import (
-    GAINS,
-    exposure_from_meta,
-    exposure_to_meta,
-    exposure_with,
-    gains_from_meta,
-)
+from gsstream.engine.state.colour_maps import GAINS, exposure_from_meta, exposure_to_meta, gains_from_meta
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.input.seeds.shell import Shell, find_shell
 from gsstream.input.seeds.thinning import thin_points
@@ -156,7 +150,7 @@ def key_state(
         hierarchy=hierarchy,
         previous=frame,
         decoders=decoders,
-        exposure=exposure_with(exposure_from_meta(player.meta), gains_from_meta(player.meta)),
+        exposure=exposure_from_meta(player.meta),
         gains=gains_from_meta(player.meta),
         key_frame=player.frame,
         shell=shell_behind(assembly, player),
@@ -181,10 +175,7 @@ def shell_behind(assembly: Assembly, player: PlayerState) -> Shell | None:
 def key_meta(
     meta: StreamMeta, exposure: Exposure | None, origin: torch.Tensor, gains: FloatArray | None = None
 ) -> StreamMeta:
-    """Return the description of the run in a key packet, with colour maps, gains and the origin [3] of the grid.
-
-    A later key packet's description has the colour maps already: ``exposure`` None leaves it as it is.
-    """
+    """Return the description of the run in a key packet, with colour maps of frame 0, gains and the grid's origin."""
     own = {**exposure_to_meta(exposure), "origin": origin.tolist()}
     if gains is not None:
         own[GAINS] = gains.tolist()

@@ -18,6 +18,7 @@ from gsstream.engine.frame0.begin import decoded_anchors, key_meta, key_state, m
 from gsstream.engine.frame0.first_layer import first_layer_mask
 from gsstream.engine.frame0.rd_quantise import rd_quantise
 from gsstream.engine.frame0.refine import SHOWN, is_refined
+from gsstream.engine.state.colour_maps import first_exposure
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.metrics import log_packet
 from gsstream.method.tools import Tools
@@ -135,7 +136,7 @@ def _key_step(
     # older frame.
     meta = replace(meta, extra={**meta.extra, SHOWN: shown})
     first = first_layer_mask(assembly, gaussians, frame, exposure=state.exposure, rng=rng) if layered else None
-    meta = key_meta(meta, None, anchors.origin, state.gains)
+    meta = key_meta(meta, first_exposure(state.player.meta), anchors.origin, state.gains)
     after, packet = key_state(
         assembly, gaussians, layout, hierarchy=hierarchy, frame=frame, meta=meta, rng=rng, first=first, before=before
     )

@@ -16,7 +16,7 @@ from gsstream.core.rng import Rng
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import decoded_anchors, memory_across_key, shell_behind
 from gsstream.engine.frame0.refine import SHOWN, advance_refinement, is_to_be_refined, start_refinement
-from gsstream.engine.state.colour_maps import exposure_from_meta, exposure_with, gains_from_meta
+from gsstream.engine.state.colour_maps import exposure_from_meta, gains_from_meta
 from gsstream.engine.state.stream_state import Refinement, StreamState, next_state
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.method.tools import Tools
@@ -124,7 +124,7 @@ def key_state_from_player(assembly: Assembly, player: PlayerState, rng: Rng) -> 
         hierarchy=rebuild_hierarchy(assembly, player),
         previous=None,  # type: ignore[arg-type]
         decoders=decoders,
-        exposure=exposure_with(exposure_from_meta(player.meta), gains_from_meta(player.meta)),
+        exposure=exposure_from_meta(player.meta),
         gains=gains_from_meta(player.meta),
         key_frame=player.frame,
         shell=shell_behind(assembly, player),

@@ -22,8 +22,8 @@ def exposure_to_meta(exposure: Exposure | None) -> dict[str, Any]:
     return {"exposure": {"matrix": exposure.matrix.tolist(), "offset": exposure.offset.tolist()}}
 
 
-def exposure_from_meta(meta: StreamMeta) -> Exposure | None:
-    """Return the colour maps that a key packet holds; an encoder, resumed or not, goes on from these values."""
+def first_exposure(meta: StreamMeta) -> Exposure | None:
+    """Return the colour maps that were fitted to the first frame, which every key packet holds."""
     stored = meta.extra.get("exposure")
     if stored is None:
         return None
@@ -34,6 +34,11 @@ def gains_from_meta(meta: StreamMeta) -> FloatArray | None:
     """Return by how much cameras had become brighter at a key packet, [C, 3]; None where none had drifted alone."""
     stored = meta.extra.get(GAINS)
     return None if stored is None else np.array(stored, np.float32)
+
+
+def exposure_from_meta(meta: StreamMeta) -> Exposure | None:
+    """Return the colour maps at a key packet; an encoder, resumed or not, goes on from these values."""
+    return exposure_with(first_exposure(meta), gains_from_meta(meta))
 
 
 def exposure_with(first: Exposure | None, gains: FloatArray | None) -> Exposure | None:

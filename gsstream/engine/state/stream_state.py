@@ -17,7 +17,7 @@ from gsstream.core.rng import Rng
 from gsstream.core.shapes import FloatArray, IntArray
 from gsstream.engine.fit.densify import DensifyStatistics
 from gsstream.engine.fit.photometric import FrameImages
-from gsstream.engine.state.colour_maps import exposure_from_meta, exposure_with
+from gsstream.engine.state.colour_maps import exposure_with, first_exposure
 from gsstream.engine.state.drift import Lit
 from gsstream.input.seeds.shell import Shell
 from gsstream.method.base import Step as MethodStep
@@ -98,7 +98,7 @@ class StreamState:
 
     def with_gains(self, gains: FloatArray) -> StreamState:
         """Return the state with cameras that have become brighter by these gains [C, 3] since the first frame."""
-        return replace(self, gains=gains, exposure=exposure_with(exposure_from_meta(self.player.meta), gains))
+        return replace(self, gains=gains, exposure=exposure_with(first_exposure(self.player.meta), gains))
 
     @property
     def gaussians(self) -> Gaussians[torch.Tensor]:

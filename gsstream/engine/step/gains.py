@@ -9,7 +9,7 @@ drawn.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -82,17 +82,31 @@ def _by_row(
     pixels: tuple[torch.Tensor, torch.Tensor],
 ) -> torch.Tensor:
     """Return [2, N, 3]: two sets [2, V, h, w, 3] of pixels, summed by the share that a Gaussian has of their light."""
-    colour = scene.sh0.clone().requires_grad_()
-    drawn = assembly.renderer.render(replace(scene, sh0=colour), cameras, view, assembly.background).image
+    drawn, by_row = drawn_by_row(assembly, scene, cameras, view)
     found = []
     for values in pixels:
         image = torch.zeros_like(drawn)
         height, width = (size // STRIDE * STRIDE for size in image.shape[:2])
         for start, grid in zip(GRIDS, values[:, view], strict=True):
             image[start:height:STRIDE, start:width:STRIDE] = grid
-        # The gradient of a pixel by a colour is that share.
-        found.append(torch.autograd.grad(drawn, colour, image, retain_graph=True)[0][:, 0].cpu() / SH0)
+        found.append(by_row(image))
     return torch.stack(found)
+
+
+def drawn_by_row(
+    assembly: Assembly, scene: Gaussians[torch.Tensor], cameras: Cameras, view: int
+) -> tuple[torch.Tensor, Callable[[torch.Tensor], torch.Tensor]]:
+    """Return what a camera sees of a scene, [H, W, 3], and what sums an image [H, W, 3] over pixels to [N, 3].
+
+    Each pixel counts by the share that a Gaussian has of its light, which is the gradient of the pixel by its colour.
+    """
+    colour = scene.sh0.clone().requires_grad_()
+    drawn = assembly.renderer.render(replace(scene, sh0=colour), cameras, view, assembly.background).image
+
+    def by_row(image: torch.Tensor) -> torch.Tensor:
+        return torch.autograd.grad(drawn, colour, image.contiguous(), retain_graph=True)[0][:, 0].cpu() / SH0
+
+    return drawn.detach(), by_row
 
 
 def camera_offsets(asked_by_view: torch.Tensor, asked: torch.Tensor, light: torch.Tensor) -> torch.Tensor:

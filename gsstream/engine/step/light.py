@@ -29,7 +29,7 @@ from gsstream.engine.frame0.refine import SHOWN
 from gsstream.engine.state.drift import EVERY, Lit, drift, looked_at
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.context import EngineContext
-from gsstream.engine.step.gains import camera_offsets, new_gains
+from gsstream.engine.step.gains import camera_offsets, drawn_by_row, new_gains
 from gsstream.engine.step.light_symbols import with_light
 from gsstream.method.packets import delta_packet
 from gsstream.method.tools import Tools
@@ -161,7 +161,7 @@ class Wanted:
         change: [N, 3] of sh0.
         worth: [N] squared error of one channel, summed over pixels, per square of a change.
         error: mean squared error of one channel of the pixels that were asked.
-        cameras: [V, 3] what each camera shows beyond what most show, image units. It is reported, not drawn.
+        cameras: [V, 3] what each camera shows beyond what most show, image units; no colour is to make up for it.
     """
 
     change: FloatArray
@@ -175,20 +175,15 @@ def wanted_colours(assembly: Assembly, scene: Gaussians[torch.Tensor], work: Eng
     asked, asked_by_view, light = torch.zeros(len(scene), 3), [], []
     errors = pixels = 0.0
     for view in range(len(work.cameras)):
-        colour = scene.sh0.clone().requires_grad_()
-        drawn = assembly.renderer.render(replace(scene, sh0=colour), work.cameras, view, assembly.background).image
+        drawn, by_row = drawn_by_row(assembly, scene, work.cameras, view)
         exposure = work.photometric.exposure[view] if work.photometric.exposure else None
-        shown = exposure.apply(drawn.detach()) if exposure else drawn.detach()
-        error = work.image(view) - shown
+        error = work.image(view) - (exposure.apply(drawn) if exposure else drawn)
         slow = (error.abs().amax(-1, keepdim=True) < MOST_ERROR).float()
         error = error * slow
-        upstream = exposure.vjp(error) if exposure else error
-        # The gradient of a pixel by a colour is the share that its Gaussian has of the pixel's light.
-        by_row = torch.autograd.grad(drawn, colour, upstream.contiguous(), retain_graph=True)[0][:, 0].cpu() / SH0
-        shares = torch.autograd.grad(drawn, colour, slow.expand(-1, -1, 3).contiguous())[0][:, 0, 0].cpu() / SH0
-        asked += by_row
-        asked_by_view.append(by_row.sum(0))
-        light.append(shares)
+        asked_by_row = by_row(exposure.vjp(error) if exposure else error)
+        asked += asked_by_row
+        asked_by_view.append(asked_by_row.sum(0))
+        light.append(by_row(slow.expand(-1, -1, 3))[:, 0])
         errors, pixels = errors + float(error.square().sum()) / 3, pixels + float(slow.sum())
     weights = torch.stack(light)
     total = weights.sum(0)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +24,7 @@ from gsstream.core.projection import inside, project
 from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.input.seeds.fusion import agreement, world_points
 from gsstream.input.seeds.geometry import neighbour_views, pixel_centers, spread_views
+from gsstream.input.seeds.sweep import CPU
 from gsstream.input.seeds.window import window_mean
 from gsstream.input.seeds.workers import one_thread_each
 
@@ -102,6 +102,7 @@ def with_room(
     accepted: BoolArray,
     given: BoolArray,
     tell: Tell = silent,
+    device: torch.device = CPU,
 ) -> tuple[FloatArray, BoolArray]:
     """Return depths [C, H, W] of which those of the room stand in where the sweep is not sure, and which are seeds.
 
@@ -114,9 +115,10 @@ def with_room(
         depths: [C, H, W] the same after interpolation where it was not sure.
         accepted: [C, H, W] bool, where enough views agree with ``depths``.
         given: [C, H, W] bool, pixels of depth maps: they stay as they are.
+        device: where the room is looked for.
     """
     support = agreement(swept, cameras, SUPPORT).support
-    room = room_depths(find_room(images, cameras, tell), cameras)
+    room = room_depths(find_room(images, cameras, tell, device), cameras)
     partners = neighbour_views(cameras, MOST_CAMERAS)
     depths, kept = depths.copy(), accepted & (given | (depths < IN_FRONT * room))
     for view in range(len(cameras)):
@@ -134,12 +136,15 @@ def with_room(
     return depths, kept
 
 
-def find_room(images: FloatArray, cameras: Cameras, tell: Tell = silent) -> Room:
-    """Return the sphere and the floor on which pictures agree best; the same for the same pictures."""
+def find_room(images: FloatArray, cameras: Cameras, tell: Tell = silent, device: torch.device = CPU) -> Room:
+    """Return the sphere and the floor on which pictures agree best, compared on ``device``.
+
+    The same for the same pictures and device.
+    """
     if len(cameras) > MOST_CAMERAS:
         chosen = spread_views(cameras, MOST_CAMERAS)
         images, cameras = images[chosen], cameras.select(chosen.tolist())
-    grey = torch.from_numpy(np.ascontiguousarray(images.mean(-1)))
+    grey = torch.from_numpy(np.ascontiguousarray(images.mean(-1))).to(device)
     focus = focus_point(cameras)
     size = float(np.linalg.norm(cameras.centers - focus, axis=1).mean())
     counted = itertools.count(1)
@@ -230,34 +235,35 @@ def _climb(
 
 
 def surface_agreement(grey: torch.Tensor, cameras: Cameras, surface: FloatArray, pool: ThreadPoolExecutor) -> float:
-    """Return how well pictures [C, H, W] agree on a surface [R, S, 3]: 0 to 1.
+    """Return how well pictures [C, H, W] agree on a surface [R, S, 3]: 0 to 1. It is computed where the pictures are.
 
     It is the mean correlation, negative ones as 0, over all pairs of cameras and textured places; less where there are
     few of them. The same for any number of workers.
     """
-    points, shape = surface.reshape(-1, 3), surface.shape[:2]
-    drawn = list(
-        pool.map(lambda view: _drawn_on(grey[view], cameras, view, points=points, shape=shape), range(len(grey)))
-    )
+    points, shape, views = surface.reshape(-1, 3), surface.shape[:2], range(len(grey))
+    drawn = list(pool.map(lambda view: _drawn_on(grey[view], cameras, view, points=points, shape=shape), views))
     shades, there = torch.stack([shade for shade, _ in drawn]), torch.stack([seen for _, seen in drawn])
     means, squares = window_mean(torch.stack([shades, shades * shades], 1), HALF).unbind(1)
     variance = (squares - means * means).clamp_min(0)
     # A window counts where all of it lies in the picture.
     usable = (window_mean(there.float()[:, None], HALF)[:, 0] > 0.99) & (variance > NOISE**2)
+    flat = usable.flatten(1).float()
+    places = (flat @ flat.T).cpu().tolist()
+    shared = {view: [other for other in views[view + 1 :] if places[view][other]] for view in views}
+    total = sum(places[view][other] for view, others in shared.items() for other in others)
+    if not total:
+        return 0.0
 
-    def compared(pair: tuple[int, int]) -> tuple[int, float]:
-        a, b = pair
-        both = usable[a] & usable[b]
-        if not bool(both.any()):
-            return 0, 0.0
-        cross = window_mean((shades[a] * shades[b])[None, None], HALF)[0, 0] - means[a] * means[b]
-        same = cross / ((variance[a] + NOISE**2) * (variance[b] + NOISE**2)).sqrt()
-        return int(both.sum()), float(same[both].clamp_min(0).sum())
+    def compared(view: int) -> torch.Tensor:
+        others = torch.tensor(shared[view]).to(grey.device)
+        both = usable[view] & usable[others]
+        cross = window_mean((shades[view] * shades[others])[:, None], HALF)[:, 0] - means[view] * means[others]
+        same = cross / ((variance[view] + NOISE**2) * (variance[others] + NOISE**2)).sqrt()
+        return same.clamp_min(0).masked_fill(~both, 0).sum(dtype=torch.float64)
 
-    total, good = 0, 0.0
-    for places, found in pool.map(compared, combinations(range(len(grey)), 2)):
-        total, good = total + places, good + found
-    return good / max(total, 1) * min(1.0, total / ENOUGH)
+    good = float(torch.stack(list(pool.map(compared, filter(shared.get, views)))).sum())
+    score: float = good / total * min(1.0, total / ENOUGH)
+    return score
 
 
 def _match(images: FloatArray, cameras: Cameras, view: int, depth: FloatArray, others: list[int]) -> Match:
@@ -285,7 +291,8 @@ def _drawn_on(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """A picture [H, W] drawn on places [P, 3]: an image of ``shape`` (P pixels), and which of its pixels are drawn."""
     uv, depth = project(points, cameras, view)
-    grid = torch.from_numpy((uv / (cameras.width, cameras.height) * 2 - 1).astype(np.float32)).reshape(1, *shape, 2)
+    grid = torch.from_numpy((uv / (cameras.width, cameras.height) * 2 - 1).astype(np.float32)).to(grey.device)
+    grid = grid.reshape(1, *shape, 2)
     drawn = F.grid_sample(grey[None, None], grid, align_corners=False, padding_mode="border")[0, 0]
     there = inside(uv, depth, cameras) & (depth > cameras.near_plane)
-    return drawn, torch.from_numpy(there.reshape(shape))
+    return drawn, torch.from_numpy(there.reshape(shape)).to(grey.device)

@@ -60,6 +60,7 @@ def photo_consistent_seeds(
     """
     check_shape("images", images, (len(cameras), cameras.height, cameras.width, 3))
     check_finite("images", images)
+    settings = settings or SweepSettings()
     known = np.full(images.shape[:3], np.nan, np.float32) if known is None else known
     given = np.isfinite(known)
     maps = int(given.any((1, 2)).sum())
@@ -71,7 +72,7 @@ def photo_consistent_seeds(
     if maps == len(cameras):
         swept, sure, origin = interpolate_depths(known, given), given, f"depth maps of {maps} cameras"
     else:
-        swept = sweep_depths(images, cameras, settings or SweepSettings(), tell)
+        swept = sweep_depths(images, cameras, settings, tell)
         swept = np.where(given, known, swept)
         tell("looking for points: comparing what the cameras found", 0, 0)
         sure = given | agreement(swept, cameras, tolerance).accepted(min_support, dominance)
@@ -86,7 +87,9 @@ def photo_consistent_seeds(
     accepted |= given
     if stands_around(cameras):
         origin += " and the room that they stand in"
-        depths, accepted = with_room(images, cameras, swept, depths=depths, accepted=accepted, given=given, tell=tell)
+        depths, accepted = with_room(
+            images, cameras, swept, depths=depths, accepted=accepted, given=given, tell=tell, device=settings.device
+        )
     xyz = np.concatenate([world_points(depths, cameras, i)[accepted[i].reshape(-1)] for i in range(len(cameras))])
     common = np.clip(images / gains[:, None, None, :], 0, 1)
     cloud = PointCloud(xyz.astype(np.float32), common[accepted], origin)

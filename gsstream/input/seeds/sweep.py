@@ -23,7 +23,7 @@ from gsstream.input.seeds.geometry import depth_range, neighbour_views, pixel_ce
 from gsstream.input.seeds.window import window_mean
 from gsstream.input.seeds.workers import one_thread_each
 
-_CPU = torch.device("cpu")
+CPU = torch.device("cpu")
 _GREY = np.array([0.299, 0.587, 0.114], np.float32)
 
 
@@ -50,7 +50,7 @@ class SweepSettings:
     step_penalty: float = 0.03
     jump_penalty: float = 1.0
     workers: int = 0
-    device: torch.device = _CPU
+    device: torch.device = CPU
 
 
 def sweep_depths(images: FloatArray, cameras: Cameras, settings: SweepSettings, tell: Tell = silent) -> FloatArray:

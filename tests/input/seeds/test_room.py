@@ -32,6 +32,7 @@ from gsstream.input.seeds.shell import BEYOND, RADIUS, SEEDS, find_shell, in_she
 from gsstream.input.seeds.shell import WIDTH as OVERLAP
 from gsstream.input.seeds.window import window_mean
 from gsstream.input.seeds.workers import one_thread_each
+from gsstream.testing.pretend import AVAILABLE, NAME
 
 #: A little off what the cameras look at.
 TRUTH = Room(np.array([0.05, -0.04, 0.02]), 3.3, np.array([0.0, 0.0, 1.0]), -0.7)
@@ -133,6 +134,14 @@ def test_pictures_agree_on_the_true_surface_only() -> None:
         black = surface_agreement(torch.zeros_like(grey), DOME, flat, pool)
     assert scores[-0.7] > 0.8 > 2 * max(scores[-1.1], scores[-0.3])
     assert black == 0, "black pictures agree on nothing"
+
+
+@pytest.mark.skipif(not AVAILABLE, reason="needs a process in which torch sees no GPU")
+def test_pictures_of_a_device_that_takes_no_tensor_of_another_agree_as_those_of_the_processor(found: Room) -> None:
+    images = photograph(TRUTH, DOME)
+    there = find_room(images, DOME, device=torch.device(NAME))
+    for value, wanted in zip(there, found, strict=True):
+        np.testing.assert_allclose(value, wanted, rtol=1e-5, atol=1e-6)
 
 
 @pytest.fixture

@@ -200,6 +200,7 @@ def _check_encoder_s_own(meta: StreamMeta) -> None:
         _array("extra.exposure.offset", maps.get("offset"), (cameras, 3))
     if "gains" in extra:
         _array("extra.gains", extra["gains"], (len(meta.train), 3))
+        _check_single("extra.gains", extra["gains"], above_zero=True)  # an encoder divides by them
     shown = extra.get("shown", 0)
     if isinstance(shown, bool) or not isinstance(shown, int) or shown < 0:
         raise ValueError(f"extra.shown: expected the number of a frame, got {shown!r:.60}")

@@ -131,6 +131,8 @@ LIES: list[tuple[str, str, Callable[[Any], Changed], tuple[Any, ...]]] = [
         {"offset": [[0, 0, 0]] * 3}, {"matrix": [np.eye(3).tolist()], "offset": [[0, 0, 0]]},
     )),
     ("exposure", "expected an object, got list", lambda said: extra(exposure=said), ([1],)),
+    ("gains", "extra.gains: expected finite numbers in", lambda said: extra(gains=said), ([[1, 1, 1]], [1, 1])),
+    ("gains", "extra.gains: " + ABOVE, lambda said: extra(gains=said), ([[1, 1, 0]] * 2, [[1, -1, 1]] * 2)),
     ("shown", "extra.shown: expected the number of a frame, got", lambda shown: extra(shown=shown), (-1, "1")),
 ]  # fmt: skip
 

@@ -1,11 +1,12 @@
 """Times of frames on a GPU, replayed and queued, for docs/results/gpu.md.
 
-    python -m tools.gpu SOURCE [KEY=VALUE ...] [--method s2gs-edge] [--frames 6] [--queued]
+    python -m tools.gpu SOURCE [KEY=VALUE ...] [--method s2gs-edge] [--frames 6] [--kernels] [--queued]
 
 Prints one JSON object a line: what machine it is, then every frame with its milliseconds by phase, its bytes, and what
 was recorded as a CUDA graph: how often, in how many milliseconds, and how often it was replayed. The first later frame
-loads libraries; look at those after it. With ``--queued`` the same frames are encoded again, operation by operation.
-Where there is no GPU nothing is recorded.
+loads libraries; look at those after it. With ``--kernels`` the last frame is profiled, which makes it slower: for how
+long the GPU was busy, and the kernels that kept it so. With ``--queued`` the frames are encoded again, operation by
+operation. Where there is no GPU nothing is recorded, and operations of the processor stand for kernels.
 """
 
 from __future__ import annotations
@@ -14,11 +15,13 @@ import argparse
 import json
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import torch
+from torch.profiler import ProfilerActivity, profile
 
 from gsstream.core.frame import Frame
 from gsstream.encode import Encoder, encoder_for, open_recording, recipe_for
@@ -100,6 +103,22 @@ def encoded(encoder: Encoder, frame: Frame, counted: Counted) -> dict[str, Any]:
     }
 
 
+def profiled(work: Callable[[], dict[str, Any]], most: int = 20) -> dict[str, Any]:
+    """Return what ``work`` does, for how long its kernels ran, how many they were, and the dearest: ms and number."""
+    is_on_gpu = torch.cuda.is_available()
+    activity = ProfilerActivity.CUDA if is_on_gpu else ProfilerActivity.CPU
+    with profile(activities=[activity]) as seen:
+        row = work()
+    spent, times = Counter[str](), Counter[str]()
+    for event in seen.events() or ():
+        if (event.device_type.name == "CUDA") == is_on_gpu:
+            spent[event.name] += event.device_time_total if is_on_gpu else event.self_cpu_time_total
+            times[event.name] += 1
+    dearest = [[name[:120], round(us / 1000, 2), times[name]] for name, us in spent.most_common(most)]
+    busy = {"busy_ms": round(sum(spent.values()) / 1000, 1), "kernels": sum(times.values()), "dearest": dearest}
+    return {**row, **busy}
+
+
 def measured(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Yield the machine, then every frame."""
     settings: dict[str, Any] = dict(text.split("=", 1) for text in options.settings)
@@ -111,7 +130,9 @@ def measured(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
             encoder = encoder_for(options.method, source, settings=settings)
             with counted.watching(queued=queued):
                 for frame in frames:
-                    yield {"queued": queued, **encoded(encoder, frame, counted)}
+                    once = partial(encoded, encoder, frame, counted)
+                    is_looked_into = options.kernels and frame is frames[-1]
+                    yield {"queued": queued, **(profiled(once) if is_looked_into else once())}
 
 
 def main(words: list[str] | None = None) -> None:
@@ -121,6 +142,7 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("settings", nargs="*", metavar="KEY=VALUE")
     parser.add_argument("--method", default="s2gs-edge")
     parser.add_argument("--frames", type=int, default=6)
+    parser.add_argument("--kernels", action="store_true", help="profile the last frame: what kept the GPU busy")
     parser.add_argument("--queued", action="store_true", help="once more, operation by operation")
     for row in measured(parser.parse_args(words)):
         print(json.dumps(row), flush=True)

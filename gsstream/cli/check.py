@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
+from gsstream.core.errors import STRANGERS, InputError, PluginUnavailable, UnknownName
 from gsstream.core.kinds import FITTING_SLOTS
 
 if TYPE_CHECKING:
@@ -107,9 +107,7 @@ def _subjects(catalog: Catalog, name: str, source: str | None, settings: list[st
         run_command_checks,
         run_method_checks,
         run_packet_checks,
-        skip_checks,
     )
-    from gsstream.testing.method_driver import effect
     from gsstream.testing.registry import SourceUnderTest
 
     if name == "packets":
@@ -128,15 +126,24 @@ def _subjects(catalog: Catalog, name: str, source: str | None, settings: list[st
             recording = SourceUnderTest(catalog.resolve(kind, part), source or guess, given=bool(source))
             yield Subject(heading, run_checks(recording))
         else:
-            cls = catalog.resolve(kind, part)
-            try:
-                built = cls(configured or cls.Config())
-            except PluginUnavailable as error:
-                yield Subject(heading, skip_checks(kind, part, str(error)), absent=True)
-            else:
-                results = run_checks(built)
-                sound = kind in FITTING_SLOTS and all(result.ok for result in results)
-                yield Subject(heading, results, effect=effect(kind, built) if sound else "")
+            yield _part_subject(kind, part, heading, catalog.resolve(kind, part), configured)
+
+
+def _part_subject(kind: str, part: str, heading: str, cls: type[Any], configured: Any) -> Subject:
+    """A part, built and checked; one that cannot be built because something is not installed is absent."""
+    from gsstream.testing.kit import CheckResult, run_checks, skip_checks
+    from gsstream.testing.method_driver import effect
+
+    try:
+        built = cls(configured or cls.Config())
+    except PluginUnavailable as error:
+        return Subject(heading, skip_checks(kind, part, str(error)), absent=True)
+    except STRANGERS as error:
+        problem = f"with {'these' if configured else 'its default'} settings: {type(error).__name__}: {error}"
+        return Subject(heading, [CheckResult("construction", part, "failed", problem)])
+    results = run_checks(built)
+    sound = kind in FITTING_SLOTS and all(result.ok for result in results)
+    return Subject(heading, results, effect=effect(kind, built) if sound else "")
 
 
 def _config(cls: type[Any], settings: list[str]) -> Any:

@@ -20,7 +20,7 @@ import typer
 
 from gsstream import API_VERSION, __version__
 from gsstream.cli.listing import plural, printable
-from gsstream.core.errors import GsstreamError
+from gsstream.core.errors import STRANGERS, GsstreamError
 from gsstream.core.install_hints import WHERE_DIST, install_any
 from gsstream.core.processors import processors
 
@@ -97,7 +97,7 @@ def _instructions(name: str) -> str:
         try:
             native = point.load()
             return f" for {native.instruction_set()}, {plural(native.num_threads(), 'thread')}"
-        except Exception as error:  # third-party code: this page exists to show whatever it raises
+        except STRANGERS as error:  # third-party code: this page exists to show whatever it raises
             return f"; its instruction set is not known: {type(error).__name__}: {error}"
     return ""
 
@@ -230,7 +230,7 @@ def _self_test(renderer: PlayerRenderer) -> tuple[bool, str]:
         picture = to_bytes(render(scene, rig, 0, renderer=renderer)).astype(int)
         seconds = time.perf_counter() - start
         truth = to_bytes(render(scene, rig, 0, renderer=named_renderer("numpy"))).astype(int)
-    except Exception as error:  # this page exists to show whatever fails
+    except STRANGERS as error:  # this page exists to show whatever fails
         return False, f"failed: {type(error).__name__}: {error}"
     apart = int(np.abs(picture - truth).max())
     said = f"{number} Gaussians written, read and drawn in {1e3 * seconds:.1f} ms, {apart} levels of 255 from numpy"

@@ -25,6 +25,8 @@ from typing import Any
 
 #: Letters of a name that nobody knows, in a message.
 LONGEST_SHOWN = 120
+#: What the code of others may raise. ``sys.exit`` is no ``Exception``, and unnoticed it would end a run without a word.
+STRANGERS = (Exception, SystemExit)
 
 
 class GsstreamError(Exception):

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsstream.core.errors import PluginUnavailable, UnknownName
+from gsstream.core.errors import STRANGERS, PluginUnavailable, UnknownName
 from gsstream.core.install_hints import install_part
 from gsstream.core.kinds import PART_KINDS
 from gsstream.discovery.discovery import Discovered, PluginFault, Spec, discover, moved, spec_key
@@ -79,7 +79,7 @@ class Catalog:
         assert not isinstance(entry.spec, MethodSpec), "methods shipped as recipes have no class"
         try:
             return _load_target(entry.spec)
-        except (Exception, SystemExit) as error:  # third-party code: any failure is reported with its owner's name
+        except STRANGERS as error:  # third-party code: any failure is reported with its owner's name
             reason = str(error) if isinstance(error, PluginFault) else f"{type(error).__name__}: {error}{moved(error)}"
             raise PluginUnavailable(f"{kind} {name!r} (from {entry.origin}) cannot be used: {reason}") from error
 

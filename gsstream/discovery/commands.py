@@ -7,7 +7,7 @@ from typing import Any
 import typer
 from typer.main import get_command
 
-from gsstream.core.errors import PluginUnavailable
+from gsstream.core.errors import STRANGERS, PluginUnavailable
 from gsstream.discovery.catalog import Catalog
 from gsstream.spec import CommandSpec
 
@@ -24,7 +24,7 @@ def command_of(spec: CommandSpec, catalog: Catalog) -> Any:
         app.command(name=spec.name)(target)
     try:
         command = get_command(app)
-    except Exception as error:  # third-party code: any failure is reported with its owner's name
+    except STRANGERS as error:  # third-party code: any failure is reported with its owner's name
         origin = catalog.entry("command", spec.name).origin
         raise PluginUnavailable(f"command {spec.name!r} (from {origin}) cannot be used: {error}") from error
     command.name = spec.name

@@ -22,7 +22,7 @@ import pluggy
 import pydantic
 
 from gsstream import API_VERSION, __version__
-from gsstream.core.errors import PluginUnavailable, suggest
+from gsstream.core.errors import STRANGERS, PluginUnavailable, suggest
 from gsstream.core.install_hints import page
 from gsstream.core.versions import MIGRATE, version_problem
 from gsstream.discovery import builtin, hookspecs
@@ -144,7 +144,7 @@ def _message(error: BaseException) -> str:
         return _refusal(error)
     try:
         return str(error).encode("utf-8", "backslashreplace").decode() + moved(error)
-    except Exception as failure:
+    except STRANGERS as failure:
         return f"its message cannot be read: {type(failure).__name__}"
 
 

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
+from gsstream.core.errors import STRANGERS, InputError, PluginUnavailable, UnknownName
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.install_hints import install_renderer
 from gsstream.core.memory import VARIABLE, memory_limit, require_memory
@@ -53,7 +53,7 @@ def find_renderer() -> PlayerRenderer:
     for point in _entry_points():
         try:
             return _load(point)
-        except Exception as error:  # third-party code: whatever it raises is reported, and the player still plays
+        except STRANGERS as error:  # third-party code: whatever it raises is reported, and the player still plays
             problems.append(f"{point.name} ({point.value}) failed: {type(error).__name__}: {error}")
     why = f". Reason: {'; '.join(problems)}" if problems else ""
     warnings.warn(
@@ -77,7 +77,7 @@ def named_renderer(name: str) -> PlayerRenderer:
         raise UnknownName("renderer of the player", name, ["numpy", *points])
     try:
         return _load(points[name])
-    except Exception as error:  # third-party code: whatever it raises is the reason
+    except STRANGERS as error:  # third-party code: whatever it raises is the reason
         value = points[name].value
         raise PluginUnavailable(f"renderer {name!r} ({value}) failed: {type(error).__name__}: {error}") from error
 

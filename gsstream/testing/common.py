@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ValidationError
 
-from gsstream.core.errors import InputError
+from gsstream.core.errors import STRANGERS, InputError
 from gsstream.core.kinds import CONTRACTS
 from gsstream.core.part import Part
 from gsstream.engine.assembly.part_in_use import line_of
@@ -198,7 +198,7 @@ def check_extremes(part: Part) -> None:
     for name in EXTREMES:
         try:
             found = outputs(part, get_case(name))
-        except Exception as error:
+        except STRANGERS as error:
             said = error if isinstance(error, AssertionError) else f"raised {type(error).__name__}: {error}"
             raise AssertionError(f"world {name!r}: {said}{line_of(error, part)}") from error
         for output, value in found.items():

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from gsstream.core.errors import STRANGERS
 from gsstream.core.kinds import PART_KINDS
 from gsstream.core.part import Part
 from gsstream.discovery.catalog import Catalog, Entry
@@ -72,7 +73,7 @@ def run_check(entry: Check, subject: Any, expected: str | None = None) -> CheckR
     except AssertionError as error:
         status: Status = "failed" if expected is None else "expected failure"
         return CheckResult(entry.name, name, status, str(error) if expected is None else f"{expected} ({error})")
-    except Exception as error:  # a part may raise anything; that is what is being found out
+    except STRANGERS as error:  # a part may raise anything; that is what is being found out
         status = "failed" if expected is None else "expected failure"
         raised = f"raised {type(error).__name__}: {error}{line_of(error, part)}"
         return CheckResult(entry.name, name, status, raised if expected is None else f"{expected} ({raised})")
@@ -166,7 +167,7 @@ def _is_test(entry: Check, part: Part | SourceUnderTest) -> bool:
     """Say whether a check is made on a part; claims that cannot be read are for the test to report."""
     try:
         return entry.trait is None or claimed(part, entry.trait)
-    except Exception:
+    except STRANGERS:
         return True
 
 

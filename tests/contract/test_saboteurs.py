@@ -6,9 +6,12 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from distribution import write_metadata
 from saboteurs import COMMAND_SABOTEURS, INSTALLED, METHOD_SABOTEURS, PACKET_SABOTEURS, SABOTEURS
 
+from gsstream.core.context import FrameContext
+from gsstream.parts.confidence.base import ConfidenceEstimator
 from gsstream.testing import MethodUnderTest
 from gsstream.testing.kit import (
     CheckResult,
@@ -41,6 +44,18 @@ def test_fails_exactly_its_check(check: str) -> None:
     assert len(found[check]) > 20
     if check == "check_rejects_nonfinite":
         assert "was nan" in found[check], "which input held it is said"
+
+
+def test_a_part_that_leaves_the_process_fails_its_checks() -> None:
+    class Leaving(ConfidenceEstimator):
+        source = "gsstream"
+
+        def estimate(self, context: FrameContext) -> torch.Tensor:
+            sys.exit(0)
+
+    found = failed(run_checks(Leaving(Leaving.Config())))
+    assert len(found) > 5
+    assert any("SystemExit: 0" in said for said in found.values()), found
 
 
 @pytest.mark.parametrize("check", PACKET_SABOTEURS)

@@ -80,6 +80,9 @@ class Failing:
     It states no closed form and has no residual optimiser of its own: a part that does is not called in the inner loop.
     """
 
+    #: What is raised; a part may leave the process, too.
+    error: type[BaseException] = RuntimeError
+
     def __init__(self, part: Any, function: str, where: Where, frame: int = BAD) -> None:
         self.__dict__.update(part=part, function=function, where=where, frame=frame)
 
@@ -103,7 +106,7 @@ class Failing:
 
     def fail(self) -> None:
         if self.where.frame == self.frame:
-            raise RuntimeError("out of order")
+            raise self.error("out of order")
 
 
 class FailingSession(RenderSession):
@@ -215,6 +218,33 @@ def test_what_a_function_raises_is_said_with_its_place_and_costs_one_frame(slot:
     assert steps[BAD].metrics["seconds"]["failed"] >= 0
     # A key packet that could not be made stays due.
     assert [step.status for step in steps[BAD + 1 :]] == (["key", "delta"] if key else ["delta", "delta"])
+
+
+@pytest.mark.parametrize(("slot", "function"), [*FUNCTIONS][::4])
+def test_a_part_that_leaves_the_process_fails_like_any_other(
+    slot: str, function: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Failing, "error", SystemExit)
+    made = spoiled(slot, function)
+    for frame in frames()[:BAD]:
+        made.encode(frame)
+    with pytest.raises(ComponentError, match="SystemExit: out of order"):
+        made.encode(frames()[BAD])
+
+
+def test_numbers_of_another_precision_are_the_failure_of_the_part_that_returned_them() -> None:
+    class Precise(Failing):
+        def __getattr__(self, name: str) -> Any:
+            value = getattr(self.part, name)
+            return (lambda *args: value(*args).double()) if name == "estimate" else value
+
+    made = encoder("confidence", lambda part, where: Precise(part, "estimate", where))
+    made.encode(frames()[0])
+    with pytest.raises(
+        ComponentError, match=r"estimate\(\): expected a tensor of torch.float32, got torch.float64"
+    ) as it:
+        made.encode(frames()[1])
+    assert it.value.slot == "confidence"
 
 
 def test_a_part_that_fails_in_frame_0_ends_there() -> None:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from gsstream.core.errors import InputError, PluginUnavailable, UnknownName
+from gsstream.core.errors import STRANGERS, InputError, PluginUnavailable, UnknownName
 from gsstream.core.install_hints import install_extra, install_renderer
 from gsstream.core.part import Part
 from gsstream.discovery.catalog import Catalog
@@ -117,7 +117,7 @@ def construct(slot: str, name: str, cls: type[Any], config: Any, catalog: Catalo
     except InputError as error:  # a setting of the user's, such as an environment variable: no other part mends it
         origin = catalog.entry(slot, name).origin
         raise InputError(f"{slot} {name!r} (from {origin}) could not be built: {error}") from error
-    except Exception as error:  # third-party constructor: reported with its owner's name
+    except STRANGERS as error:  # third-party constructor: reported with its owner's name
         origin = catalog.entry(slot, name).origin
         raise PluginUnavailable(f"{slot} {name!r} (from {origin}) could not be built: {error}") from error
     return part

@@ -12,6 +12,7 @@ from typing import Any, TypeVar, cast
 import torch
 
 from gsstream.core.changes import Field, Motion, RowEdit
+from gsstream.core.errors import STRANGERS
 from gsstream.core.part import unwrapped
 from gsstream.engine.assembly.checks import UNIT, Checks
 from gsstream.engine.assembly.part_in_use import PartInUse, Where
@@ -122,7 +123,7 @@ class Guarded:
             return partial(self._on_guard, body)
         try:
             value = getattr(self._subject, name)
-        except Exception as error:
+        except STRANGERS as error:
             if isinstance(error, AttributeError) and getattr_static(self._subject, name, None) is None:
                 raise  # the part has no such attribute, which the caller may test for
             with use.errors():  # an error in a property is a failure of the part like any other

@@ -14,7 +14,7 @@ from traceback import walk_tb
 import torch
 
 from gsstream.core.deferred import MakeError, named_checks, require
-from gsstream.core.errors import ComponentError, GsstreamError, InputError, ShapeError
+from gsstream.core.errors import STRANGERS, ComponentError, GsstreamError, InputError, ShapeError
 from gsstream.engine.assembly.checks import Checks
 from gsstream.spec import ENTRY_POINT_GROUP
 
@@ -70,7 +70,7 @@ class PartInUse:
             if isinstance(error, ShapeError) or (self.slot == "renderer" and isinstance(error, InputError)):
                 raise self.fault(str(error)) from error
             raise
-        except Exception as error:
+        except STRANGERS as error:
             raise self.fault(f"{type(error).__name__}: {error}{line_of(error, self.part)}") from error
 
     def _named(self, error: MakeError) -> MakeError:
@@ -80,13 +80,13 @@ class PartInUse:
     def output(
         self, what: str, value: object, shape: tuple[int, ...], limits: tuple[float, float] | None = None
     ) -> None:
-        """Raise ComponentError unless ``value`` is a finite floating point tensor of this shape, within ``limits``.
+        """Raise ComponentError unless ``value`` is a finite tensor of float32 of this shape, within ``limits``.
 
         Type and shape are always looked at; numbers once per frame, and with the level "step" in every iteration.
         """
-        if not isinstance(value, torch.Tensor) or not value.dtype.is_floating_point:
+        if not isinstance(value, torch.Tensor) or value.dtype != torch.float32:
             got = str(value.dtype) if isinstance(value, torch.Tensor) else type(value).__name__
-            raise self.fault(f"{what}: expected a floating point tensor, got {got}")
+            raise self.fault(f"{what}: expected a tensor of torch.float32, got {got}")
         if tuple(value.shape) != shape:
             raise self.fault(f"{what}: expected shape {list(shape)}, got {list(value.shape)}")
         least = Checks.FRAME if self.where.iteration is None else Checks.STEP
@@ -185,7 +185,7 @@ def wrong_value(
     return f"expected {wanted}, got {float(value[index])!r} at {place} ({int(bad.sum())} of {bad.numel()} values)"
 
 
-def line_of(error: Exception, part: object) -> str:
+def line_of(error: BaseException, part: object) -> str:
     """Return the line of the part's own package that was being run, as `` (gate.py:42)``."""
     package = type(part).__module__.partition(".")[0]
     found = ""

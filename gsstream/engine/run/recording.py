@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from gsstream.core.errors import GsstreamError, PacketError, PluginUnavailable, RecipeError
+from gsstream.core.errors import STRANGERS, GsstreamError, PacketError, PluginUnavailable, RecipeError
 from gsstream.discovery.catalog import Catalog
 from gsstream.input.recordings.base import Source
 from gsstream.input.recordings.canonical import CanonicalSource, recording_similarity
@@ -72,7 +72,7 @@ def open_plain(uri: str, scale: float, catalog: Catalog) -> Source:
             raise TypeError(f"expected a gsstream.api.Source, got {type(source).__name__}")
     except GsstreamError:
         raise
-    except Exception as error:  # third-party code: reported with its owner's name
+    except STRANGERS as error:  # third-party code: reported with its owner's name
         raise PluginUnavailable(f"source {scheme!r} (from {entry.origin}) could not open {uri!r}: {error}") from error
     return source
 

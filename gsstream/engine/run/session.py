@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,7 @@ from gsstream.engine.run.measured_again import measure_again
 from gsstream.engine.run.metrics_log import add_metrics, append_metrics, last_written, trim_metrics, written_lines
 from gsstream.engine.run.output import write_whole
 from gsstream.engine.run.progress import RunProgress
+from gsstream.engine.run.same_pictures import PICTURES, KnownPictures, sums
 from gsstream.input.recordings.base import Moment, Source, SourceInfo
 from gsstream.input.recordings.origin import RECORDING, whole_uri
 from gsstream.input.recordings.prefetch import Prefetcher
@@ -152,7 +152,7 @@ class _Run:
         """Write the cost and the quality of a frame to the metrics file."""
         metrics = {**step.metrics, **numbers, "live": live_metrics(train, self.written)}
         metrics["displacement_pixels"] = displacement_pixels(step.state.player, train.cameras)
-        metrics |= start_numbers(train)
+        metrics |= {**start_numbers(train), PICTURES: sums(train)}
         if sentence := self.blank.look(train):
             warnings.warn(sentence, stacklevel=2)
         # A run that is behind does not spend time on the quality of frames that it drops: ``evaluate`` measures it.
@@ -191,8 +191,11 @@ class _Run:
         wanted: int | None = last_written(log)
         if not planned and wanted == -1:
             wanted = None
-        past = past_moments(written_lines(log))
-        last = self.encoder.resume(stream, partial(self._encoded, past), wanted)
+        lines = written_lines(log)
+        past, known = past_moments(lines), KnownPictures(lines)
+        last = self.encoder.resume(stream, lambda index: known.looked_at(self._encoded(past, index)), wanted)
+        if last is not None:
+            known.check(str(self.encoder.state.player.meta.extra.get("source_uri", "")), self.source.info.uri)
         if wanted is not None:
             _warn_lost_lines(stream, -1 if last is None else last)
         kept = trim_metrics(log, -1 if last is None else last)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
-from gsstream.core.errors import EndOfRecording, GsstreamError, InputError, SourceError
+from gsstream.core.errors import STRANGERS, EndOfRecording, GsstreamError, InputError, SourceError
 from gsstream.core.frame import Frame
 from gsstream.input.recordings.base import Source
 from gsstream.input.recordings.canonical import to_file_coordinates
@@ -98,6 +98,6 @@ def _read_pair(source: Source, index: int, pack: bool) -> FramePair:
         return read(index, "train"), read(index, "test")
     except GsstreamError:
         raise
-    except Exception as error:  # a source may be a plugin's: its failure is reported with its name
+    except STRANGERS as error:  # a source may be a plugin's: its failure is reported with its name
         name = type(to_file_coordinates(source)).__name__
         raise SourceError(f"{name} could not read frame {index}: {type(error).__name__}: {error}") from error

@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from gsstream.core.errors import STRANGERS
 from gsstream.recipe.load import ResolvedRecipe
 
 #: The file that says that a result is whole; written last.
@@ -50,7 +51,7 @@ def run_batch_job(job: BatchJob) -> BatchOutcome:
     try:
         with tempfile.TemporaryDirectory(dir=job.work, prefix="batch-") as folder:
             return _run(job, Path(folder))
-    except Exception as error:  # the seam of a batch: one bad recording is a record, not the end
+    except STRANGERS as error:  # the seam of a batch: one bad recording is a record, not the end
         return BatchOutcome(job.id, error=f"{type(error).__name__}: {error}", details=traceback.format_exc())
 
 

@@ -15,6 +15,7 @@ import importlib.metadata
 import warnings
 from typing import Any, Protocol, cast
 
+from gsstream.core.errors import STRANGERS
 from gsstream_lab.bench.roofline import Peak
 
 ENTRY_POINT_GROUP = "gsstream.bench"
@@ -60,7 +61,7 @@ def find_native(name: str) -> NativeBench | None:
     for point in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP, name=name):
         try:
             return cast(NativeBench, point.load())
-        except Exception as error:  # third-party code: the renderer can still be measured through its part
+        except STRANGERS as error:  # third-party code: the renderer can still be measured through its part
             why = f"{type(error).__name__}: {error}"
             warnings.warn(f"the benchmark {name!r} ({point.value}) cannot be loaded: {why}", stacklevel=2)
     return None

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gsstream.core.errors import STRANGERS
 from gsstream.recipe.load import ResolvedRecipe
 from gsstream_lab.sweep.config import Measure
 
@@ -66,7 +67,7 @@ def run_job(job: Job) -> Outcome:
     try:
         with tempfile.TemporaryDirectory(dir=job.work, prefix="cell-") as folder:
             return _run(job, Path(folder))
-    except Exception as error:  # the seam of a sweep: one bad cell is a record, not the end
+    except STRANGERS as error:  # the seam of a sweep: one bad cell is a record, not the end
         return Outcome(job.id, error=f"{type(error).__name__}: {error}", details=traceback.format_exc())
 
 

@@ -99,7 +99,7 @@ def _check(kind: str, out: Path) -> None:
     """Raise InputError for a format that is not known or lacks its package, OutputError for the name of a file."""
     if kind not in FORMATS:
         raise InputError(f"cannot export to {kind!r}: expected one of {', '.join(FORMATS)}")
-    if out.suffix.lower() in _SUFFIXES and not out.is_dir():
+    if out.suffix.lower() in (*_SUFFIXES, ".html") and not out.is_dir():
         raise OutputError(f"{out}: expected a folder for the files, got the name of a file")
     if kind == "usd":
         require_usd()

@@ -186,6 +186,7 @@ def check_dtype_and_device(part: Part) -> None:
     """Outputs stay float32, or float64 where logits are an input of that type, and on the input's device."""
     for case in (get_case("cloud"), get_case("cloud").double()):
         for name, value in outputs(part, case).items():
+            assert isinstance(value, torch.Tensor), f"{name}: expected a tensor, got {type(value).__name__}"
             assert value.device == case.logits.device, f"{name}: expected {case.logits.device}, got {value.device}"
             if value.dtype.is_floating_point:
                 want = case.logits.dtype if behaviour_of(part).keeps_precision else torch.float32

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import functools
 import importlib
+import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
+
+import torch
 
 from gsstream.core.errors import STRANGERS
 from gsstream.core.kinds import PART_KINDS
@@ -65,7 +69,8 @@ def run_check(entry: Check, subject: Any, expected: str | None = None) -> CheckR
             return CheckResult(entry.name, name, "skipped", missing)
         if entry.kind == "method" and isinstance(subject, StreamingMethod):
             subject = method_driver.around(subject)
-        entry.function(subject)
+        with _process_left_alone():
+            entry.function(subject)
     except Skip as reason:
         return CheckResult(entry.name, name, "skipped", str(reason))
     except Advice as advice:
@@ -80,6 +85,23 @@ def run_check(entry: Check, subject: Any, expected: str | None = None) -> CheckR
     if expected is not None:
         return CheckResult(entry.name, name, "failed", f"passed, but was expected to fail: {expected}; drop the entry")
     return CheckResult(entry.name, name, "passed")
+
+
+@contextmanager
+def _process_left_alone() -> Iterator[None]:
+    """Raise AssertionError where what happens within changes what the whole process goes by, and set that back."""
+    kept = torch.get_default_dtype(), torch.get_num_threads(), os.getcwd()
+    try:
+        yield
+    finally:
+        found = torch.get_default_dtype(), torch.get_num_threads(), os.getcwd()
+        names = "torch.set_default_dtype", "torch.set_num_threads", "os.chdir"
+        changed = [name for name, before, after in zip(names, kept, found, strict=True) if before != after]
+        if changed:
+            torch.set_default_dtype(kept[0])
+            torch.set_num_threads(kept[1])
+            os.chdir(kept[2])
+            raise AssertionError(f"what the whole process goes by was changed: {', '.join(changed)}; leave that alone")
 
 
 def claimed(subject: Any, trait: str) -> bool:

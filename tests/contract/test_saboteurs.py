@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -56,6 +58,26 @@ def test_a_part_that_leaves_the_process_fails_its_checks() -> None:
     found = failed(run_checks(Leaving(Leaving.Config())))
     assert len(found) > 5
     assert any("SystemExit: 0" in said for said in found.values()), found
+
+
+@pytest.mark.parametrize(
+    "leak",
+    [lambda: torch.set_default_dtype(torch.float64), lambda: torch.set_num_threads(3), lambda: os.chdir("/")],
+    ids=["dtype", "threads", "folder"],
+)
+def test_a_part_that_changes_the_process_fails_and_the_process_is_set_back(leak: Callable[[], None]) -> None:
+    class Leaking(ConfidenceEstimator):
+        source = "gsstream"
+
+        def estimate(self, context: FrameContext) -> torch.Tensor:
+            leak()
+            return torch.zeros_like(context.gaussians.opacities)
+
+    torch.set_num_threads(1)
+    before = torch.get_default_dtype(), torch.get_num_threads(), os.getcwd()
+    found = failed(run_checks(Leaking(Leaking.Config())))
+    assert (torch.get_default_dtype(), torch.get_num_threads(), os.getcwd()) == before
+    assert any("what the whole process goes by was changed" in said for said in found.values()), found
 
 
 @pytest.mark.parametrize("check", PACKET_SABOTEURS)

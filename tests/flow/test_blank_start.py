@@ -13,7 +13,7 @@ from PIL import Image
 from gsstream.cli.main import run_command
 from gsstream.core.cameras import Cameras
 from gsstream.core.frame import Frame
-from gsstream.engine.run.blank import BlankStart, blank_views
+from gsstream.engine.run.blank import BlankCameras, BlankStart, blank_views
 
 
 def black(folder: Path, *frames: int) -> None:
@@ -58,3 +58,26 @@ def test_what_shows_nothing() -> None:
     assert watcher.look(later) == ""
     assert "frame 2 is the first" in watcher.look(Frame(2, 0.0, both.images, cameras))
     assert watcher.look(Frame(3, 0.0, both.images, cameras)) == ""
+
+
+def test_a_camera_that_goes_black_is_named_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = demo_copy(tmp_path / "recording", frames=4)
+    one = sorted(path.name for path in folder.iterdir() if path.is_dir())[1]
+    for frame in (1, 2):
+        black_picture = folder / one / f"{frame:06d}.jpg"
+        with Image.open(black_picture) as image:
+            Image.new("RGB", image.size).save(black_picture)
+    assert run_command(arguments(tmp_path / "out", source=str(folder), first_frame__max_iterations=8)) == 0
+    said = capsys.readouterr().err
+    assert said.count(f"warning: camera {one} shows nothing in frame 1, but one colour") == 1
+    assert said.count("shows nothing") == 1
+
+
+def test_cameras_that_never_showed_anything_are_not_named_again() -> None:
+    cameras = Cameras(("a", "b"), np.stack([np.eye(4)] * 2), np.stack([np.eye(3)] * 2), 64, 48)
+    ramp = np.broadcast_to(np.linspace(0, 1, 64, dtype=np.float32)[None, :, None], (48, 64, 3))
+    shown, half = np.stack([ramp, ramp]), np.stack([np.zeros_like(ramp), ramp])
+    watcher = BlankCameras()
+    said = [watcher.look(Frame(at, 0.0, images, cameras)) for at, images in enumerate((half, half, shown, 0 * shown))]
+    assert said[:3] == ["", "", ""]
+    assert said[3].startswith("camera b shows nothing in frame 3")

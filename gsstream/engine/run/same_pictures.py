@@ -54,9 +54,7 @@ class KnownPictures:
         if share and made_from != now:
             raise OutputError(f"{what}: {made_from!r}, with the same cameras; resume with the same --source")
         if share == 1:
-            warnings.warn(
-                f"{what}: another take, or files that are decoded otherwise; it goes on", stacklevel=3
-            )
+            warnings.warn(f"{what}: another take, or files that are decoded otherwise; it goes on", stacklevel=3)
 
 
 def _by_camera(said: str) -> list[str]:

@@ -18,7 +18,7 @@ from gsstream.core.frame import Frame, PointCloud
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.memory import limit_memory
 from gsstream.engine.frame0.points import gather_points, with_test_views
-from gsstream.engine.run.blank import BlankStart, start_numbers
+from gsstream.engine.run.blank import BlankCameras, BlankStart, start_numbers
 from gsstream.engine.run.displacement import displacement_pixels
 from gsstream.engine.run.encoder import Callbacks, EncodedFrame, Encoder
 from gsstream.engine.run.few_cameras import expectation, first_frame_summary
@@ -124,7 +124,7 @@ class _Run:
         self.source, self.out = source, out
         self.total = _num_frames(source.info, assembly.recipe.frames)
         self.held_out = HeldOut(assembly.renderer) if measure else None
-        self.progress, self.blank = RunProgress(self.total, quiet), BlankStart()
+        self.progress, self.blank = RunProgress(self.total, quiet), (BlankStart(), BlankCameras())
         listeners = Callbacks(packet=self._write, progress=self.progress.first_frame)
         self.encoder = Encoder(assembly, source.info, self._seeds, first_frame=first_frame, callbacks=listeners)
         self.writer: StreamWriter
@@ -153,7 +153,7 @@ class _Run:
         metrics = {**step.metrics, **numbers, "live": live_metrics(train, self.written)}
         metrics["displacement_pixels"] = displacement_pixels(step.state.player, train.cameras)
         metrics |= {**start_numbers(train), PICTURES: sums(train)}
-        if sentence := self.blank.look(train):
+        for sentence in filter(None, (watcher.look(train) for watcher in self.blank)):
             warnings.warn(sentence, stacklevel=2)
         # A run that is behind does not spend time on the quality of frames that it drops: ``evaluate`` measures it.
         dropped = metrics["live"] is not None and metrics["live"]["policy"] == "dropped"

@@ -56,7 +56,8 @@ def new_gains(
     # What moved is left out, and a camera whose exposure jumped is not taken for one before which everything moved.
     own = ratio_in_most(pixels)[:, None, None] * first
     still = ((changed - own).abs().amax(-1, keepdim=True) <= STILL).float()
-    kept = changed * still, first * still
+    kept = still * _within(before) * _within(now)
+    kept = changed * kept, first * kept
     asked = torch.stack([_by_row(assembly, scene, cameras, view=v, pixels=kept) for v in range(len(cameras))])
     errors, lights = asked[:, 0], asked[:, 1].clamp_min(0)
     # A share of the brightness is an offset in a scene whose light is the brightness.
@@ -71,6 +72,12 @@ def new_gains(
         return now.gains
     gains[told] = after[told]
     return gains
+
+
+def _within(lit: Lit) -> torch.Tensor:
+    """Return where a channel of a pixel is neither at its end: one that is says less than what came to the camera."""
+    top = 1.0 if lit.pixels.is_floating_point() else 255
+    return ((lit.pixels > 0) & (lit.pixels < top)).float()
 
 
 def _by_row(

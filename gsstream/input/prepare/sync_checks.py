@@ -90,7 +90,7 @@ def _unknown(cameras: Cameras, seen: list[Motion], lost: list[int]) -> list[Find
     return [
         note(
             "sync",
-            f"clocks{which}: not checkable (what moves covers {share:.1g} % of the pictures from one frame to the "
+            f"clocks{which}: not checkable (what moves covers {share:.2g} % of the pictures from one frame to the "
             "next); more frames may show more",
         )
     ]

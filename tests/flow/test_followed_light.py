@@ -114,6 +114,13 @@ def test_a_camera_that_drifts_alone_is_told_and_takes_nothing_of_the_test_camera
     assert quality(drifts, slice(16, 26)) > quality(alone, slice(16, 26)) - 0.1
 
 
+def test_a_camera_that_gets_so_bright_that_it_is_clipped_is_told_by_what_is_not(rooms: Rooms) -> None:
+    out = rooms.run("paths", around="disturbed:drift=cam02@0.06:")
+    told = {line["frame"]: line["camera_drift"][2] for line in metrics(out) if "camera_drift" in line}
+    for frame in (5, 10, 15):
+        np.testing.assert_allclose(told[frame], 6.0 * frame, atol=1.0)
+
+
 def test_a_drift_that_is_slower_than_the_light_adds_up(rooms: Rooms) -> None:
     """The frame that pictures are compared with is another one each time the colours follow the light."""
     out = rooms.run("dim", around="disturbed:drift=cam02@-0.001:")

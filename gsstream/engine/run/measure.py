@@ -20,6 +20,8 @@ from gsstream.parts.backend.base import Renderer
 LOW_PSNR_DB, MAX_DROP_DB = 20.0, 4.0
 #: Training views that are looked at.
 MAX_TRAIN_VIEWS = 4
+#: Factor by which a test camera may become brighter or darker beside what is drawn for it, before that is said.
+OUT_OF_LIGHT = 1.2
 
 
 class HeldOut:
@@ -33,6 +35,9 @@ class HeldOut:
         self._renderer = renderer
         self._first: Frame | None = None
         self._sigma: list[float] = []
+        #: Test camera -> brightness of its picture beside the drawn one, in the first frame and in the last.
+        self._light: dict[str, tuple[float, float]] = {}
+        self._told: set[str] = set()
 
     def measure(self, player: PlayerState, frame: Frame) -> dict[str, Any]:
         """Return PSNR, SSIM and PSNR of moving and changed pixels by test camera; None where undefined."""
@@ -44,6 +49,8 @@ class HeldOut:
         for view, name in enumerate(frame.cameras.ids):
             image = self.render(player, frame, view)
             truth, first = frame.image(view), self._first.image(view)
+            light = float(truth.mean()) / max(float(image.mean()), 1e-3)
+            self._light[name] = self._light.get(name, (light,))[0], light
             moving = moving_mask(truth, first, self._sigma[view]) if self._sigma else np.zeros(truth.shape[:2], bool)
             quality = picture_quality(image, truth, moving, changed=changed_mask(truth, first))
             for key, value in quality._asdict().items():
@@ -64,6 +71,19 @@ class HeldOut:
             f"held-out cameras show {np.mean(held_out):.1f} dB of frame 0, training cameras {seen:.1f} dB: poses, "
             "lenses or clocks are probably wrong, or the held-out cameras see what no training camera sees"
         )
+
+    def out_of_light(self, frame: int) -> str:
+        """Return a warning, once for each test camera, when it gets brighter or darker and what is drawn does not."""
+        for name, (first, last) in self._light.items():
+            share = last / max(first, 1e-3)
+            if name not in self._told and not 1 / OUT_OF_LIGHT < share < OUT_OF_LIGHT:
+                self._told.add(name)
+                became = f"{100 * abs(share - 1):.0f} % {'darker' if share < 1 else 'brighter'}"
+                return (
+                    f"test camera {name} has become {became} than what is drawn for it by frame {frame}: its exposure "
+                    "changes, or it is covered, and its numbers say little about the stream"
+                )
+        return ""
 
     def remember(self, first: Frame, second: Frame | None) -> None:
         """Keep frame 0, and the noise between the first two frames, from which frames of a resumed run are measured."""

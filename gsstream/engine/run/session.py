@@ -159,6 +159,8 @@ class _Run:
         dropped = metrics["live"] is not None and metrics["live"]["policy"] == "dropped"
         if self.held_out and len(test.cameras) and not dropped:
             metrics |= self.held_out.measure(step.state.player, self.encoder.with_near_plane(test))
+            if sentence := self.held_out.out_of_light(test.index):
+                warnings.warn(sentence, stacklevel=2)
             if train.index == 0:
                 doubt = self.held_out.doubt(step.state.player, self.encoder.with_near_plane(train), metrics["psnr"])
                 if doubt:

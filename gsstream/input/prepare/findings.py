@@ -17,6 +17,7 @@ CHECKS = {
     "overlap": "every training camera shares its view with another one",
     "images": "every image can be decoded and has the declared size",
     "blank": "no camera is black or of one colour",
+    "colour": "no camera is grey while others have colours",
     "same": "no two cameras deliver the same pictures",
     "frozen": "no camera stands still while others change",
     "repeated": "no camera repeats a frame while others go on",

@@ -13,6 +13,8 @@ from gsstream.input.recordings.base import Source
 
 FLAT = 2.5 / 255
 JUMP = 0.08
+#: Mean distance between the channels of a pixel below which a camera is grey, and above which it has colours.
+GREY, COLOURED = 0.5 / 255, 4.0 / 255
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +57,22 @@ def check_blank(thumbs: Thumbnails) -> list[Finding]:
                 )
             )
     return found
+
+
+def check_colour(thumbs: Thumbnails) -> list[Finding]:
+    """Find cameras whose pictures are grey while those of others have colours."""
+    apart = np.ptp(thumbs.images, axis=-1).mean((0, 2, 3))
+    if np.median(apart) < COLOURED:
+        return []
+    return [
+        warning(
+            "colour",
+            f"camera {thumbs.cameras.ids[c]!r} is grey, most others have colours; its pictures pull the colours of all "
+            "that it sees towards grey. Export it again, or take it out",
+        )
+        for c in np.flatnonzero(apart < GREY)
+        if thumbs.images[:, c].std() > FLAT
+    ]
 
 
 def check_same(thumbs: Thumbnails) -> list[Finding]:

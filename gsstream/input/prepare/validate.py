@@ -16,7 +16,14 @@ from gsstream.core.frame import Frame, join_frames, shrink_frame
 from gsstream.core.install_hints import install_extra
 from gsstream.input.prepare.findings import Finding, error, note
 from gsstream.input.prepare.match_checks import check_matches
-from gsstream.input.prepare.picture_checks import Thumbnails, check_blank, check_change, check_same, read_thumbnails
+from gsstream.input.prepare.picture_checks import (
+    Thumbnails,
+    check_blank,
+    check_change,
+    check_colour,
+    check_same,
+    read_thumbnails,
+)
 from gsstream.input.prepare.pose_checks import check_poses, check_swapped
 from gsstream.input.prepare.rig_checks import check_axes, check_intrinsics, check_overlap, check_placement
 from gsstream.input.prepare.sync_checks import check_sync
@@ -88,6 +95,7 @@ def _stages(source: Source, open_scene: Open, frames: int, *, features: bool, sa
         yield [error("images", str(fault))]
         return
     yield check_blank(thumbs)
+    yield check_colour(thumbs)
     yield check_same(thumbs)
     yield check_change(thumbs)
     # Before clocks: where poses do not fit, what moves seems to be at different places although clocks may be right.

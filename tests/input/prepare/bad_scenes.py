@@ -256,6 +256,9 @@ BAD = (
     BadScene("black-frame", "one black frame", "blank", lambda f, d: save(
         f / "cam03/000004.png", 0 * load(f / "cam03/000004.png")
     )),
+    BadScene("grey", "a camera without colours among others", "colour", lambda f, d: pictures(
+        f, "cam03", lambda i, t: i.mean(-1, keepdims=True).repeat(3, -1)
+    )),
     BadScene("leaked-test", "the test camera shows a training camera's pictures", "same",
              lambda f, d: copy_camera(f, "cam03", "test")),
     BadScene("frozen", "a camera stands still", "frozen", lambda f, d: [

@@ -35,8 +35,8 @@ class HeldOut:
         self._renderer = renderer
         self._first: Frame | None = None
         self._sigma: list[float] = []
-        #: Test camera -> brightness of its picture beside the drawn one, in the first frame and in the last.
-        self._light: dict[str, tuple[float, float]] = {}
+        #: Test camera -> brightness of its picture and of the drawn one, in the first frame and in the last.
+        self._light: dict[str, tuple[FloatArray, FloatArray]] = {}
         self._told: set[str] = set()
 
     def measure(self, player: PlayerState, frame: Frame) -> dict[str, Any]:
@@ -49,7 +49,7 @@ class HeldOut:
         for view, name in enumerate(frame.cameras.ids):
             image = self.render(player, frame, view)
             truth, first = frame.image(view), self._first.image(view)
-            light = float(truth.mean()) / max(float(image.mean()), 1e-3)
+            light = np.array([truth.mean(), image.mean()]).clip(1e-3)
             self._light[name] = self._light.get(name, (light,))[0], light
             moving = moving_mask(truth, first, self._sigma[view]) if self._sigma else np.zeros(truth.shape[:2], bool)
             quality = picture_quality(image, truth, moving, changed=changed_mask(truth, first))
@@ -75,8 +75,9 @@ class HeldOut:
     def out_of_light(self, frame: int) -> str:
         """Return a warning, once for each test camera, when it gets brighter or darker and what is drawn does not."""
         for name, (first, last) in self._light.items():
-            share = last / max(first, 1e-3)
-            if name not in self._told and not 1 / OUT_OF_LIGHT < share < OUT_OF_LIGHT:
+            seen, drawn = last / first
+            share = seen / drawn
+            if name not in self._told and abs(np.log(seen)) > np.log(OUT_OF_LIGHT) < abs(np.log(share)):
                 self._told.add(name)
                 became = f"{100 * abs(share - 1):.0f} % {'darker' if share < 1 else 'brighter'}"
                 return (

@@ -56,8 +56,8 @@ def new_gains(
     # What moved is left out, and a camera whose exposure jumped is not taken for one before which everything moved.
     own = ratio_in_most(pixels)[:, None, None] * first
     still = ((changed - own).abs().amax(-1, keepdim=True) <= STILL).float()
-    kept = still * _within(before) * _within(now)
-    kept = changed * kept, first * kept
+    counted = still * _within(before) * _within(now)
+    kept = changed * counted, first * counted
     asked = torch.stack([_by_row(assembly, scene, cameras, view=v, pixels=kept) for v in range(len(cameras))])
     errors, lights = asked[:, 0], asked[:, 1].clamp_min(0)
     # A share of the brightness is an offset in a scene whose light is the brightness.

@@ -11,6 +11,7 @@ import random
 import re
 import signal
 import time
+import weakref
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,8 @@ from flow_runs import WORLD, arguments, encode, finish, metrics
 from forked import Forked, gsstream
 
 from gsstream.cli.main import run_command
+from gsstream.encode import open_recording
+from gsstream.engine.run.session import _stop_on_interrupt
 from gsstream.packet import StreamReader
 
 #: The one with most to remember; runs of ``dense`` are resumed all over the other files of this folder.
@@ -169,6 +172,30 @@ def noted(self, frame):
     return encode(self, frame)
 Encoder.encode = noted
 """
+
+
+@pytest.mark.parametrize("ends", ["finalize", "__del__"])
+def test_an_interrupt_that_comes_while_an_object_ends_is_not_lost(ends: str, capfd: pytest.CaptureFixture[str]) -> None:
+    class Thing:
+        if ends == "__del__":
+
+            def __del__(self) -> None:
+                signal.raise_signal(signal.SIGINT)
+
+    def made_and_ended() -> None:
+        thing = Thing()
+        if ends == "finalize":
+            weakref.finalize(thing, signal.raise_signal, signal.SIGINT)
+        del thing
+        time.sleep(60)
+
+    with (
+        open_recording("demo") as source,
+        _stop_on_interrupt(lambda _: None, source, lambda: False),
+        pytest.raises(KeyboardInterrupt),
+    ):
+        made_and_ended()
+    assert "ignored" not in capfd.readouterr().err
 
 
 def test_interrupted_twice_it_does_not_wait_for_the_frame(tmp_path: Path) -> None:

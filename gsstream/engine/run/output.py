@@ -15,6 +15,7 @@ from io import TextIOWrapper
 from pathlib import Path
 from types import FrameType
 from typing import Any
+from weakref import finalize
 
 from gsstream.core.errors import OutputError
 from gsstream.input.recordings.origin import RECORDING
@@ -200,3 +201,12 @@ def check_output(out: Path, *, resume: bool = False, overwrite: bool = False) ->
         cure = "begin anew with --overwrite" if present else "leave --resume out to start a run there"
         raise OutputError(f"nothing to resume: {out} holds no stream.gss; {cure}")
     return present
+
+
+def is_finalising(frame: FrameType | None) -> bool:
+    """Say whether a frame is called, however far, by the end of an object, in which no error reaches its caller."""
+    while frame is not None:
+        if frame.f_code is finalize.__call__.__code__ or frame.f_code.co_name == "__del__":
+            return True
+        frame = frame.f_back
+    return False

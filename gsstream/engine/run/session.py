@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import itertools
 import os
 import signal
@@ -12,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from gsstream.core.frame import Frame, PointCloud
@@ -26,7 +28,7 @@ from gsstream.engine.run.live import live_metrics, past_moments
 from gsstream.engine.run.measure import HeldOut
 from gsstream.engine.run.measured_again import measure_again
 from gsstream.engine.run.metrics_log import add_metrics, append_metrics, last_written, trim_metrics, written_lines
-from gsstream.engine.run.output import write_whole
+from gsstream.engine.run.output import is_finalising, write_whole
 from gsstream.engine.run.progress import RunProgress
 from gsstream.engine.run.same_pictures import PICTURES, KnownPictures, sums
 from gsstream.input.recordings.base import Moment, Source, SourceInfo
@@ -291,9 +293,12 @@ def _stop_on_interrupt(
         yield stop
         return
 
-    def handler(*_: object) -> None:
+    def handler(_: int, frame: FrameType | None) -> None:
         source.interrupt()  # the frame in flight may be one that is not captured yet
         if stop.is_set() or not begun():
+            if is_finalising(frame):  # what is raised there is printed, and lost: the signal comes once more after it
+                threading.Timer(0.01, _thread.interrupt_main).start()
+                return
             raise KeyboardInterrupt
         stop.set()
         say("stopping after this frame; interrupt again to stop at once")

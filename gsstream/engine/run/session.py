@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import itertools
 import os
 import signal
@@ -297,7 +296,7 @@ def _stop_on_interrupt(
         source.interrupt()  # the frame in flight may be one that is not captured yet
         if stop.is_set() or not begun():
             if is_finalising(frame):  # what is raised there is printed, and lost: the signal comes once more after it
-                threading.Timer(0.01, _thread.interrupt_main).start()
+                threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
                 return
             raise KeyboardInterrupt
         stop.set()

@@ -10,9 +10,12 @@ from pathlib import Path
 import pytest
 import torch
 from distribution import write_metadata
+from pydantic import Field
 from saboteurs import COMMAND_SABOTEURS, INSTALLED, METHOD_SABOTEURS, PACKET_SABOTEURS, SABOTEURS
 
+from gsstream.cli.check import _part_subject
 from gsstream.core.context import FrameContext
+from gsstream.core.part import PartConfig
 from gsstream.parts.confidence.base import ConfidenceEstimator
 from gsstream.testing import MethodUnderTest
 from gsstream.testing.kit import (
@@ -58,6 +61,19 @@ def test_a_part_that_leaves_the_process_fails_its_checks() -> None:
     found = failed(run_checks(Leaving(Leaving.Config())))
     assert len(found) > 5
     assert any("SystemExit: 0" in said for said in found.values()), found
+
+
+def test_a_part_whose_settings_refuse_their_own_default_fails_in_a_sentence() -> None:
+    class Refusing(ConfidenceEstimator):
+        source = "gsstream"
+
+        class Config(PartConfig):
+            gain: float = Field(default=1000.0, le=100, description="of nothing")
+
+    (result,) = _part_subject("confidence", "refusing", "heading", Refusing, None).results
+    assert (result.check, result.status) == ("construction", "failed")
+    assert result.message.startswith("with its default settings: ValidationError: ")
+    assert "gain" in result.message
 
 
 @pytest.mark.parametrize(

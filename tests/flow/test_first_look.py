@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
-from flow_runs import DEMO_FOLDER, arguments, demo_copy
+from flow_runs import arguments, demo_copy
 
 from gsstream.cli.main import run_command
 from gsstream.core.frame import Frame, join_frames
@@ -161,16 +161,11 @@ def test_a_frame_0_far_below_its_training_views_is_doubted(frame: Frame) -> None
 
 
 def test_a_test_camera_that_gets_darker_alone_is_named_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (test,) = (
-        camera
-        for camera in json.loads((DEMO_FOLDER / "cameras.json").read_text())["cameras"]
-        if camera["split"] == "test"
-    )
-    for around, times in ((f"disturbed:drift={test['id']}@-0.15:", 1), ("disturbed:gain=0.9:", 0)):
-        command = arguments(
-            tmp_path / str(times), "--frames", "4", source=f"{around}demo", first_frame__max_iterations=40
-        )
-        assert run_command(command) == 0
+    with open_recording("demo") as source:
+        (test,) = source.info.test.ids
+    for around, times in ((f"disturbed:drift={test}@-0.15:", 1), ("disturbed:gain=0.9:", 0)):
+        out = tmp_path / str(times)
+        assert run_command(arguments(out, "--frames", "4", source=f"{around}demo", first_frame__max_iterations=40)) == 0
         said = capsys.readouterr().err
-        assert said.count(f"warning: test camera {test['id']} has become") == times
+        assert said.count(f"warning: test camera {test} has become") == times
         assert said.count("has become") == times

@@ -28,9 +28,7 @@ def test_every_frame_is_a_line_twice_where_asked(capsys: pytest.CaptureFixture[s
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="expects a machine without a GPU")
 def test_the_last_frame_says_what_it_did(capsys: pytest.CaptureFixture[str]) -> None:
-    main(
-        ["synthetic:frames=3&views=4&width=48&height=32", "first_frame.max_iterations=8", "--frames", "2", "--kernels"]
-    )
+    main([*SHORT, "--kernels"])
     _, first, last = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert "kernels" not in first
     names, spent, times = zip(*last["dearest"], strict=True)

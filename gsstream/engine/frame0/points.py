@@ -12,14 +12,13 @@ from gsstream.input.recordings.base import Source
 from gsstream.input.recordings.depth_maps import read_depth_maps
 from gsstream.input.seeds.seeding import photo_consistent_seeds
 from gsstream.input.seeds.shell import shell_points
-from gsstream.input.seeds.sweep import SweepSettings
+from gsstream.input.seeds.sweep import CPU, SweepSettings
 from gsstream.input.seeds.thinning import thin_points
 from gsstream.recipe.model import FirstFrame
 
 #: With fewer points than this a scene cannot be reconstructed: "auto" then looks for more by a plane sweep.
 SPARSE = 2000
 SWEEP_WIDTH = 160
-CPU = torch.device("cpu")
 
 
 def gather_points(

@@ -63,8 +63,7 @@ class BlankCameras:
         ids = frame.cameras.ids
         blank = {name for name, nothing in zip(ids, are_blank(frame), strict=True) if nothing}
         if self._showed is None:
-            self._showed = set(ids)
-            self._showed -= blank
+            self._showed = set(ids) - blank
             return ""
         gone = sorted(self._showed & blank)
         self._showed -= blank

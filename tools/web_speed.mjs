@@ -8,6 +8,7 @@
 import { readFileSync } from "node:fs";
 
 import "../gsstream/web/changes/field.js";
+import "../gsstream/web/changes/light.js";
 import "../gsstream/web/layers.js";
 import { viewsOf } from "../gsstream/web/camera.js";
 import { KIND, KIND_NAMES } from "../gsstream/web/container.js";

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from gsstream.core.errors import PacketError
 from gsstream.core.gaussians import ATTRIBUTES
 
-FORMAT_MAJOR, FORMAT_MINOR = 2, 3
+FORMAT_MAJOR, FORMAT_MINOR = 2, 4
 FORMAT_VERSION = f"{FORMAT_MAJOR}.{FORMAT_MINOR}"
 #: First byte not ASCII, a CR LF and a lone LF: text-mode transfers and terminals are noticed, as in PNG.
 MAGIC = b"\x89GSS\r\n\x1a\n"
@@ -62,7 +62,7 @@ class PacketKind(IntEnum):
 
 SECTION_NAMES: Mapping[int, str] = {
     1: "meta", 2: "layout", 3: "gates", 4: "decoders", 5: "index", 6: "removed", 7: "added",
-    8: "motion", 9: "pattern", 10: "field", 11: "layers", 12: "rest",
+    8: "motion", 9: "pattern", 10: "field", 11: "layers", 12: "rest", 13: "light",
     **{16 + i: name for i, name in enumerate(ATTRIBUTES)}
 }  # fmt: skip
 SECTION_IDS: Mapping[str, int] = {name: number for number, name in SECTION_NAMES.items()}

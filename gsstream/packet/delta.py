@@ -5,18 +5,19 @@ from __future__ import annotations
 import operator
 from collections.abc import Mapping
 
-from gsstream.core.changes import Delta, Layout, Motion, Scene
+from gsstream.core.changes import Delta, Layout, Light, Motion, Scene, apply_light
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.gaussians import ATTRIBUTES
 from gsstream.core.shapes import FloatArray
-from gsstream.packet.base import EncodedPacket, PacketKind, Section, build_packet, expect
+from gsstream.packet.base import EncodedPacket, PacketKind, Section, add_offset, build_packet, expect
 from gsstream.packet.changes.field import decode_field, encode_field
+from gsstream.packet.changes.light import decode_light, encode_light
 from gsstream.packet.changes.motion import decode_motions, encode_motions
 from gsstream.packet.changes.residual import decode_residual, encode_residual
 from gsstream.packet.changes.rows import decode_rows_change, encode_rows_change
 
 #: Sections of a delta packet in the order in which they stand there.
-SECTIONS = ("motion", "field", "gates", "pattern", "decoders", *ATTRIBUTES, "removed", "added")
+SECTIONS = ("light", "motion", "field", "gates", "pattern", "decoders", *ATTRIBUTES, "removed", "added")
 
 
 def next_decoders(previous: Mapping[str, FloatArray], delta: Delta) -> dict[str, FloatArray]:
@@ -45,7 +46,8 @@ def encode_delta(
 
     Raises ShapeError when a change does not fit the layout, or when there is none: that is an empty packet.
     """
-    sections = _motion_sections(delta.motions, known)
+    sections = [] if delta.light is None else encode_light(delta.light)
+    sections += _motion_sections(delta.motions, known)
     if delta.field is not None:
         sections += encode_field(delta.field)
     if delta.residual is not None:
@@ -67,11 +69,23 @@ def decode_delta(data: bytes, scene: Scene, previous_decoders: Mapping[str, Floa
     """Decode a complete delta packet. Raises PacketError with the byte offset."""
     _, sections = expect(data, offset, PacketKind.DELTA)
     _check_sections(sections, offset)
+    light = decode_light(sections["light"]) if "light" in sections else None
+    if light is not None:
+        with add_offset(sections["light"].offset):
+            scene = _lit(scene, light)  # motions form groups by brightness
     motions = decode_motions(sections["motion"], scene) if "motion" in sections else ()
     field = decode_field(sections["field"], scene, motions) if "field" in sections else None
     residual = decode_residual(sections, scene.layout, previous_decoders)
     rows = decode_rows_change(sections, scene.layout)
-    return Delta((*motions, *(change for change in (field, residual, rows) if change is not None)))
+    changes = (light, *motions, field, residual, rows)
+    return Delta(tuple(change for change in changes if change is not None))
+
+
+def _lit(scene: Scene, light: Light) -> Scene:
+    try:
+        return apply_light(scene, light)
+    except ShapeError as error:
+        raise PacketError(str(error)) from error
 
 
 def _check_sections(sections: Mapping[str, Section], offset: int) -> None:

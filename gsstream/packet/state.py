@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from gsstream.core.changes import Delta, Displacement, Layout, Scene, apply_delta
+from gsstream.core.changes import Delta, Displacement, Layout, Scene, apply_delta, lit_background
 from gsstream.core.errors import PacketError, ShapeError
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.shapes import FloatArray
@@ -25,7 +25,7 @@ class PlayerState:
     Arguments:
         frame: frame index.
         scene: the scene of that frame, and what of the frames before it the next packet may refer to.
-        meta: that of the last key packet.
+        meta: that of the last key packet, with the background in the light of this frame.
         decoders: the decoders last sent since then.
         delta: what the packet of this frame changed; None after a key or an empty packet.
         before: the layout that ``delta`` refers to, that of the frame before; None without a delta.
@@ -80,7 +80,9 @@ def decode_packet(state: PlayerState | None, data: bytes, *, offset: int = 0) ->
         return replace(state, frame=header.frame, scene=still, delta=None, before=None, replaced=None, empty=number)
     delta = decode_delta(data, state.scene, state.decoders, offset=offset)
     try:
-        scene = apply_delta(state.scene, delta)
+        scene, meta = apply_delta(state.scene, delta), state.meta
+        if delta.light is not None:
+            meta = replace(meta, background=lit_background(meta.background, delta.light))
     except ShapeError as error:
         raise PacketError(str(error), offset) from error
     if state.empty and scene.displacement is not None:  # the way of several frames
@@ -89,7 +91,7 @@ def decode_packet(state: PlayerState | None, data: bytes, *, offset: int = 0) ->
     return PlayerState(
         frame=header.frame,
         scene=scene,
-        meta=state.meta,
+        meta=meta,
         decoders=decoders,
         delta=delta,
         before=state.layout,

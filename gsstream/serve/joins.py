@@ -46,6 +46,8 @@ def encode_join(key: PlayerState, state: PlayerState, source: IntArray) -> bytes
     if displacement is not None:
         arrays.append(_steps(displacement.rows))
         arrays += [_planes(_bits(part)) for part in (displacement.translation, displacement.rotation)]
+    if state.meta.background != key.meta.background:
+        facts["background"] = state.meta.background
     head = json.dumps(facts, separators=(",", ":")).encode()
     body = len(head).to_bytes(4, "little") + head + b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)
     packed = zstandard.ZstdCompressor(level=_LEVEL, write_content_size=True).compress(body)

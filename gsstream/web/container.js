@@ -11,7 +11,7 @@ const MAGIC = [0x89, 0x47, 0x53, 0x53, 0x0d, 0x0a, 0x1a, 0x0a];
 export const KIND = { key: 1, delta: 2, empty: 3, index: 4 };
 export const KIND_NAMES = { 1: "key", 2: "delta", 3: "empty", 4: "index" };
 const SECTION_NAMES = [
-  ...",meta,layout,gates,decoders,index,removed,added,motion,pattern,field,layers,rest,,,".split(","),
+  ...",meta,layout,gates,decoders,index,removed,added,motion,pattern,field,layers,rest,light,,".split(","),
   ...ATTRIBUTES,
 ];
 

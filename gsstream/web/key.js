@@ -12,7 +12,7 @@ import { decodeSymbols, within } from "./symbols.js";
 import { decompress } from "./vendor/fzstd.js";
 
 /** What decodes these sections, once its module is loaded. */
-export const later = { layers: null, field: null };
+export const later = { layers: null, field: null, light: null };
 
 /**
  * Decode the sections of a key packet of `size` bytes at `offset`: `{ scene, layout, meta, rest }`, where `rest` is how

@@ -3,7 +3,7 @@
 import { PacketError } from "./errors.js";
 
 export const FORMAT_MAJOR = 2;
-export const FORMAT_MINOR = 3;
+export const FORMAT_MINOR = 4;
 export const MAX_GAUSSIANS = 4_000_000;
 export const FREE_GAUSSIANS = 1 << 16;
 export const MAX_GAUSSIANS_PER_BYTE = 64;

@@ -1,6 +1,7 @@
 // A stream as it is written: packets from a socket, decoded when they come, the newest one shown.
 
 import "./changes/field.js";
+import "./changes/light.js";
 import { FILE_HEADER, KIND, PACKET_HEADER, checkFileHeader, parseHeader } from "./container.js";
 import { PacketError } from "./errors.js";
 import { LiveParts } from "./live-parts.js";

@@ -99,6 +99,9 @@ function piecesOf(segment, entry, base) {
   }));
 }
 
+/** What decodes sections that are rare, by their numbers. */
+const MODULES = { 10: () => import("./changes/field.js"), 13: () => import("./changes/light.js") };
+
 /**
  * Packets `{ data, offset, header }` of a segment as they arrive. `onPart` gets the walker while it holds a part of
  * a packet with layers. Throws PacketError or SourceError.
@@ -113,10 +116,10 @@ export async function* packetsOf(segment, signal, onPart) {
     walker ??= make();
     walker.push(chunk);
     for (let packet = walker.next(); packet; packet = walker.next()) {
-      // Section 10 is a field, and 11, which begins a packet, are layers.
-      if ([...sectionsOf(packet.data)].includes(10)) await import("./changes/field.js");
+      for (const number of sectionsOf(packet.data)) await MODULES[number]?.();
       yield packet;
     }
+    // Section 11, which begins a packet, are layers.
     if (walker.ahead(17)?.[16] === 11) onPart?.(walker);
   }
   (walker ?? make()).finish();

@@ -164,11 +164,10 @@ export class Stream {
   }
 
   _send(name, state, more) {
-    const { frame, number, meta } = state;
+    const { frame, number, meta, background } = state;
     const { update, transfer } = this.packer.pack(state);
     const told = meta === this.meta ? undefined : meta;
     this.meta = meta;
-    const { background } = meta;
     this.say({ [name]: { ...update, frame, gaussians: number, background, meta: told, ...more } }, transfer);
   }
 

@@ -7,6 +7,7 @@ import { KIND } from "../../gsstream/web/container.js";
 import { decodePacket } from "../../gsstream/web/decode.js";
 import { PacketError } from "../../gsstream/web/errors.js";
 import "../../gsstream/web/changes/field.js";
+import "../../gsstream/web/changes/light.js";
 import "../../gsstream/web/layers.js";
 import { PacketWalker } from "../../gsstream/web/walker.js";
 import { sceneBytes } from "../web/scene-bytes.mjs";

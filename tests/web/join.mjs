@@ -8,6 +8,7 @@ import { readFileSync } from "node:fs";
 
 import { decodePacket } from "../../gsstream/web/decode.js";
 import "../../gsstream/web/changes/field.js";
+import "../../gsstream/web/changes/light.js";
 import "../../gsstream/web/layers.js";
 import { decodeJoin } from "../../gsstream/web/joins.js";
 import { sceneBytes } from "./scene-bytes.mjs";

@@ -7,6 +7,7 @@ import { createHash } from "node:crypto";
 import { readFileSync, writeFileSync } from "node:fs";
 
 import "../../gsstream/web/changes/field.js";
+import "../../gsstream/web/changes/light.js";
 import { KIND } from "../../gsstream/web/container.js";
 import { decodePacket } from "../../gsstream/web/decode.js";
 import { firstLayer } from "../../gsstream/web/layers.js";

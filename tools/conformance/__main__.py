@@ -14,6 +14,7 @@ from tools.conformance import (
     edits,
     frames,
     keys,
+    lights,
     lying_deltas,
     lying_files,
     lying_keys,
@@ -31,7 +32,7 @@ FOLDER = Path(__file__).parents[2] / "tests" / "conformance"
 
 def all_vectors() -> Iterator[Vector]:
     """Every vector, in the order of the modules."""
-    sound = (keys, residuals, moving, edits, rounding, frames)
+    sound = (keys, residuals, moving, edits, lights, rounding, frames)
     for module in (*sound, lying_files, lying_keys, lying_metas, lying_deltas, lying_moves, lying_rows):
         yield from module.vectors()
 

@@ -102,7 +102,9 @@ def _files() -> Iterator[Vector]:
     newer = Tape().start(332, 8, 4, 3)
     newer.delta(residual(newer, 1, ["means", "sh0"]))
     yield playing("file-of-version-2.1", "container versions pattern", "1.1-5", newer.bytes(minor=1, index=True))
-    yield playing("file-of-version-2.2", "container versions pattern", "1.1-5", newer.bytes(minor=2))
+    for minor in (2, 3):
+        name = f"file-of-version-2.{minor}"
+        yield playing(name, "container versions pattern", "1.1-5", newer.bytes(minor=minor))
     yield playing(
         "file-layers-in-version-2.0",
         "container versions layers",

@@ -41,7 +41,7 @@ def _headers() -> Iterator[Vector]:
         "file-header-damaged": (sound[:12] + bytes([sound[12] ^ 1]) + sound[13:], "1.1-2"),
         "file-version-1.1": (header(1, 1) + sound[16:], "1.1-3"),
         "file-version-3.0": (header(3, 0) + sound[16:], "1.1-3"),
-        "file-version-2.4": (header(2, 4) + sound[16:], "1.1-4"),
+        "file-version-2.5": (header(2, 5) + sound[16:], "1.1-4"),
         "file-without-packets": (sound[:16], "1.4-4"),
         "file-with-half-a-key-packet": (sound[:300], "1.4-4"),
     }
@@ -84,7 +84,7 @@ def _sections() -> Iterator[Vector]:
     }
     for name, (body, sections, rules) in bodies.items():
         yield refusing(name, "container", rules, begun().lie(seal(DELTA, 2, body, sections)))
-    for number in (0, 13, 15, 22, 255):
+    for number in (0, 14, 15, 22, 255):
         tape = begun().refused([("gates", OPEN), (number, b"")])
         yield refusing(f"section-unknown-{number}", "container versions", "1.3-4", tape)
     yield refusing(

@@ -57,7 +57,7 @@ def packet(kind: int, frame: int, sections: Sequence[tuple[str | int, bytes]]) -
     return seal(kind, frame, b"".join(struct.pack("<BI", n, len(data)) + data for n, data in numbers), len(numbers))
 
 
-def header(major: int = 2, minor: int = 3) -> bytes:
+def header(major: int = 2, minor: int = 4) -> bytes:
     """Return the header of a file."""
     start = struct.pack("<8sHH", MAGIC, major, minor)
     return start + struct.pack("<I", zlib.crc32(start))
@@ -180,7 +180,7 @@ class Tape:
         """Add a delta packet that no reader plays."""
         return self.lie(packet(DELTA, self.next, _list(sections)))
 
-    def bytes(self, *, index: bool = False, minor: int = 3) -> bytes:
+    def bytes(self, *, index: bool = False, minor: int = 4) -> bytes:
         """Return the file."""
         return file_of(self.packets, index=index, minor=minor)
 
@@ -189,7 +189,7 @@ def _list(sections: Sequence[tuple[str | int, bytes]] | Mapping[str, bytes]) -> 
     return list(sections.items()) if isinstance(sections, Mapping) else list(sections)
 
 
-def file_of(packets: Sequence[bytes], *, index: bool = False, minor: int = 3) -> bytes:
+def file_of(packets: Sequence[bytes], *, index: bool = False, minor: int = 4) -> bytes:
     """Return a file of packets."""
     out, keys, frame = header(minor=minor), b"", 0
     for data in packets:

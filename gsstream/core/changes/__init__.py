@@ -14,6 +14,10 @@ from gsstream.core.changes.field import apply_field as apply_field
 from gsstream.core.changes.field import field_rows as field_rows
 from gsstream.core.changes.hashgrid import FieldShape as FieldShape
 from gsstream.core.changes.history import Displacement as Displacement
+from gsstream.core.changes.light import Light as Light
+from gsstream.core.changes.light import apply_light as apply_light
+from gsstream.core.changes.light import lit_background as lit_background
+from gsstream.core.changes.light import sendable_factor as sendable_factor
 from gsstream.core.changes.motion import Motion as Motion
 from gsstream.core.changes.motion import apply_motion as apply_motion
 from gsstream.core.changes.motion import groups_for as groups_for

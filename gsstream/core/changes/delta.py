@@ -12,6 +12,7 @@ import numpy as np
 
 from gsstream.core.changes.field import Field, apply_field
 from gsstream.core.changes.history import displacement_between
+from gsstream.core.changes.light import Light, apply_light
 from gsstream.core.changes.motion import Motion, apply_motions, union_rows
 from gsstream.core.changes.residual import Residual, apply_residual, sent_rows
 from gsstream.core.changes.rows import AddedGaussians, RowEdit, apply_row_edit, gather_rows, join_rows
@@ -19,27 +20,32 @@ from gsstream.core.changes.scene import Layout, Scene
 from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import FloatArray, IntArray
 
-Change: TypeAlias = Motion | Field | Residual | RowEdit
+Change: TypeAlias = Light | Motion | Field | Residual | RowEdit
 #: The order in which kinds of changes stand in a delta; only motions may stand there more than once.
-ORDER: tuple[type[Motion] | type[Field] | type[Residual] | type[RowEdit], ...] = (Motion, Field, Residual, RowEdit)
+ORDER: tuple[type[Change], ...] = (Light, Motion, Field, Residual, RowEdit)
 
 
 @dataclass(frozen=True, slots=True)
 class Delta:
-    """One frame's changes, applied one after the other: motions, then at most one of each other kind.
+    """One frame's changes, applied one after the other: a light, motions, a field, a residual and a change of rows.
 
-    These are a field, a residual and a change of rows, in this order. Raises ShapeError for another order.
+    Each is optional; of motions there may be several. Raises ShapeError for another order.
     """
 
     changes: tuple[Change, ...] = ()
 
     def __post_init__(self) -> None:
         ranks = [ORDER.index(type(change)) for change in self.changes]
-        if ranks != sorted(ranks) or max(map(ranks.count, (1, 2, 3))) > 1:
+        if ranks != sorted(ranks) or max(map(ranks.count, (0, 2, 3, 4))) > 1:
             names = ", ".join(type(change).__name__ for change in self.changes)
             raise ShapeError(
-                f"delta: expected motions, then one field, then one residual, then one change of rows; got {names}"
+                f"delta: expected one light, then motions, then one field, one residual and one change of rows; got {names}"
             )
+
+    @property
+    def light(self) -> Light | None:
+        """The factor on all colours, if there is one."""
+        return next((change for change in self.changes if isinstance(change, Light)), None)
 
     @property
     def motions(self) -> tuple[Motion, ...]:
@@ -90,8 +96,13 @@ class Delta:
         """Return the same delta with another residual, or with none."""
         others: list[Change] = [change for change in self.changes if not isinstance(change, Residual)]
         if residual is not None:
-            others.insert(len(self.motions) + (self.field is not None), residual)
+            others.insert((self.light is not None) + len(self.motions) + (self.field is not None), residual)
         return Delta(tuple(others))
+
+    def with_light(self, light: Light | None) -> Delta:
+        """Return the same delta in another light, or with none."""
+        others = tuple(change for change in self.changes if not isinstance(change, Light))
+        return Delta(others if light is None or light.is_empty else (light, *others))
 
     def with_row_edit(self, row_edit: RowEdit | None) -> Delta:
         """Return the same delta with another change of rows, or with none."""
@@ -104,6 +115,8 @@ def apply_delta(scene: Scene, delta: Delta) -> Scene:
 
     Rows that no change touches keep their bits. Raises ShapeError when the delta does not fit the scene.
     """
+    if delta.light is not None:
+        scene = apply_light(scene, delta.light)
     after, touched = apply_motions(scene, delta.motions)
     if delta.field is not None:
         after, rows = apply_field(after, delta.field)

@@ -56,10 +56,9 @@ export function applyResidual(state, residual) {
   for (let i = 0; i < rows.length; i += 1) scale[i] = gate[i] * units[unitOf[rows[i]]];
   for (const part of parts) {
     // A symbol of 0 adds 0 or -0, which changes nothing but a value of -0. Of these there are none except where a
-    // motion was: key packets and added Gaussians hold multiples of a step, and no sum of two others is -0.
+    // motion or a light was: key packets and added Gaussians hold multiples of a step, and no sum of two others is -0.
     const values = state.scene[part.name];
-    const turned = state.turned && (part.name === "means" || part.name === "quats");
-    const zeros = turned && holdMinusZero(values, rows, part.width);
+    const zeros = state.turned && holdMinusZero(values, rows, part.width);
     const sent = zeros && part.places ? { ...part, symbols: spread(part, rows.length), places: null } : part;
     const add = part.decoder ? addDecoded : addDirect;
     add(values, rows, part.name === "means" ? scale : gate, sent, zeros);

@@ -54,6 +54,7 @@ class Stream {
       displaced: places[7] ? new Uint8Array(buffer, places[7], rows) : null,
       translations: floats(8, 3) || null,
       rotations: floats(9, 3) || null,
+      background: new Float32Array(buffer, at + 56, 3),
     };
   }
 

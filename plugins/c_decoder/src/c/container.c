@@ -4,7 +4,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 
-enum { HEADER = 16, MINOR = 3 };
+enum { HEADER = 16, MINOR = 4 };
 
 /* The CRC-32 of a byte, four bits at a time: reflected polynomial EDB88320. */
 uint32_t gss_crc(uint32_t before, const uint8_t *bytes, size_t size)
@@ -133,6 +133,7 @@ static int apply(gss_stream *s, const packet *p)
         memset(next, 0, sizeof *next);
         memset(&s->meta[meta], 0, sizeof s->meta[meta]);
         TRY(gss_key_packet(s, p, next, &s->meta[meta]));
+        memcpy(next->scene.background, s->meta[meta].background, sizeof next->scene.background);
         s->meta_now = meta;
         s->now = !s->now;
     } else {

@@ -20,7 +20,7 @@
 
 enum {
     META = 1, LAYOUT = 2, GATES = 3, DECODERS = 4, INDEX = 5, REMOVED = 6, ADDED = 7, MOTION = 8, PATTERN = 9,
-    FIELD = 10, LAYERS = 11, REST = 12, MEANS = 16, QUATS = 17, SCALES = 18, OPACITIES = 19, SH0 = 20, SHN = 21
+    FIELD = 10, LAYERS = 11, REST = 12, LIGHT = 13, MEANS = 16, QUATS = 17, SCALES = 18, OPACITIES = 19, SH0 = 20, SHN = 21
 };
 enum { KEY_PACKET = 1, DELTA_PACKET = 2, EMPTY_PACKET = 3, INDEX_PACKET = 4 };
 enum { ATTRIBUTES = 6, MOST_SECTIONS = 16, MOST_ROWS = 4000000, MOST_UNITS = 64, MOST_META = 1 << 20 };
@@ -119,6 +119,7 @@ static inline float f32_at(const uint8_t *p)
     memcpy(&value, &bits_of, 4);
     return value;
 }
+float gss_half(const uint8_t *p);                                          /* binary16 */
 static inline int i8_at(const uint8_t *p) { return *p < 128 ? *p : *p - 256; }
 static inline span rest_of(span from, uint32_t skip)
 {
@@ -135,8 +136,9 @@ int gss_unpack(gss_stream *s, span frame, region *keep, uint8_t **content, uint3
 uint32_t gss_width(const gss_frame *scene, unsigned attribute);
 float *gss_column(const gss_frame *scene, unsigned attribute);
 
-/* delta.c, motion.c, field.c, residual.c, rows.c: a delta changes next, a copy of last */
+/* delta.c, light.c, motion.c, field.c, residual.c, rows.c: a delta changes next, a copy of last */
 int gss_delta_packet(gss_stream *s, const packet *p, const state *last, state *next);
+int gss_apply_light(gss_stream *s, span section, state *next);
 int gss_motions(gss_stream *s, span section, const state *last, state *next, uint8_t *touched);
 void gss_turn(const double by[4], float quat[4]);
 void gss_unit_quaternion(const double rotation[3], double quat[4]);

@@ -1,7 +1,7 @@
 /* The steps of a delta, displacements: sections 4.2 and 4.3. */
 #include "decoder.h"
 
-static const uint8_t order[] = {MOTION, FIELD, GATES, PATTERN, DECODERS, MEANS, QUATS, SCALES, OPACITIES, SH0, SHN,
+static const uint8_t order[] = {LIGHT, MOTION, FIELD, GATES, PATTERN, DECODERS, MEANS, QUATS, SCALES, OPACITIES, SH0, SHN,
                                 REMOVED, ADDED};
 
 static int check_sections(gss_stream *s, const packet *p)
@@ -101,6 +101,9 @@ int gss_delta_packet(gss_stream *s, const packet *p, const state *last, state *n
     uint8_t *touched = gss_zeros(s, &s->scratch, last->scene.rows, 1);
     TRY(touched);
     const span *motion = gss_section(p, MOTION), *field = gss_section(p, FIELD);
+    const span *light = gss_section(p, LIGHT);
+    if (light)
+        TRY(gss_apply_light(s, *light, next));
     if (motion)
         TRY(gss_motions(s, *motion, last, next, touched));
     if (field)

@@ -50,6 +50,7 @@ typedef struct {
     const uint8_t *displaced;    /* [N], 1 where a row has a displacement (section 4.3), or NULL where no row has one */
     const float *translations;   /* [N, 3], of displaced rows; 0 for others; NULL with displaced */
     const float *rotations;      /* [N, 3], likewise: axis times tangent of half the angle */
+    float background[3];         /* what is behind everything, in the light of this frame; red green blue */
 } gss_frame;
 
 /* A camera of the last key packet (section 3.3). */

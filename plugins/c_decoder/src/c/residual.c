@@ -46,13 +46,6 @@ static int read_pattern(gss_stream *s, const packet *p, opened *rows)
     return 1;
 }
 
-static float half_at(const uint8_t *p)
-{
-    uint32_t bits_of = u16_at(p), exponent = bits_of >> 10 & 31, fraction = bits_of & 1023;
-    double size = exponent ? ldexp(1024.0 + fraction, (int)exponent - 25) : ldexp(fraction, -24);
-    return (float)(bits_of >> 15 ? -size : size);
-}
-
 static int fits(unsigned attribute, uint32_t width)
 {
     gss_frame none = {0};
@@ -74,7 +67,7 @@ static int read_decoders(gss_stream *s, const packet *p, matrix *decoders, int s
         for (uint32_t i = 0; i < count; i++) {
             const uint8_t *at = from.at + 3 + 2 * i;
             NEED(s, (u16_at(at) >> 10 & 31) != 31, "R-4.6-2");
-            weights[i] = half_at(at);
+            weights[i] = gss_half(at);
         }
         decoders[attribute].latents = latents;
         decoders[attribute].width = width;

@@ -30,7 +30,7 @@ const span *gss_section(const packet *p, unsigned number)
     return NULL;
 }
 
-static int known(unsigned number) { return (number >= META && number <= REST) || (number >= MEANS && number <= SHN); }
+static int known(unsigned number) { return (number >= META && number <= LIGHT) || (number >= MEANS && number <= SHN); }
 
 static int check_file(gss_stream *s)
 {

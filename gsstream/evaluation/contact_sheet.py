@@ -128,7 +128,7 @@ def sheet_of_stream(
         first = source.frame(playback.frames[0], split).images[place]
         for frame in frames:
             state = playback.player_state(frame)
-            image = np.clip(render(state.gaussians, rig, 0, background=meta.background, renderer=renderer), 0, 1)
+            image = np.clip(render(state.gaussians, rig, 0, background=state.meta.background, renderer=renderer), 0, 1)
             truth = source.frame(frame, split).images[place]
             painted = paint_gates(state)
             active = (

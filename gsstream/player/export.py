@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -24,6 +24,8 @@ from gsstream.player.ply import write_ply
 from gsstream.player.rows import tracked
 from gsstream.player.spz import spz_bytes
 from gsstream.player.usd import require_usd, write_usd
+
+Colour: TypeAlias = tuple[float, float, float]
 
 #: Formats of one file per frame -> suffix; a sequence has a description beside the PLYs.
 PER_FRAME = {"ply": ".ply", "spz": ".spz", "glb": ".glb", "sequence": ".ply"}
@@ -83,11 +85,10 @@ def export(
                 _write_whole(playback, chosen, world, written[0], said or _quiet, tell)
             else:
                 write = _writer(kind, playback.meta.world, world, origin)
-                for done, (frame, file) in enumerate(zip(chosen, written, strict=True), 1):
-                    write(file, world.gaussians(playback.state_at(frame)))
-                    tell(done, len(chosen))
-            if kind == "sequence":
-                (folder / "sequence.json").write_text(_description(playback, chosen, world), encoding="utf-8")
+                backgrounds = _write_each(playback, chosen, world, files=written, write=write, tell=tell)
+                if kind == "sequence":
+                    described = _description(playback, chosen, backgrounds, world)
+                    (folder / "sequence.json").write_text(described, encoding="utf-8")
         except OSError as error:
             raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
     if damage is not None:
@@ -131,6 +132,23 @@ def _quiet(*_: object) -> None:
 
 def _write(path: Path, data: bytes) -> None:
     path.write_bytes(data)
+
+
+def _write_each(
+    playback: Playback,
+    frames: Sequence[int],
+    world: World,
+    files: Sequence[Path],
+    write: Callable[[Path, Gaussians[FloatArray]], None],
+    tell: Callable[[int, int], None],
+) -> list[Colour]:
+    """Write a file of each frame; return what is behind each."""
+    backgrounds: list[Colour] = []
+    for frame, file in zip(frames, files, strict=True):
+        write(file, world.gaussians(playback.state_at(frame)))
+        backgrounds.append(playback.meta.background)
+        tell(len(backgrounds), len(frames))
+    return backgrounds
 
 
 def _write_whole(
@@ -188,7 +206,7 @@ def _world_of_files(playback: Playback, frames: Sequence[int], kind: str, origin
     return world
 
 
-def _description(playback: Playback, frames: Sequence[int], world: World) -> str:
+def _description(playback: Playback, frames: Sequence[int], backgrounds: Sequence[Colour], world: World) -> str:
     meta = playback.meta
     cameras = [
         {
@@ -202,11 +220,16 @@ def _description(playback: Playback, frames: Sequence[int], world: World) -> str
         for split, rig in (("train", world.cameras(meta.train)), ("test", world.cameras(meta.test)))
         for name, view, K in zip(rig.ids, rig.viewmats, rig.Ks, strict=True)
     ]
-    files = [{"frame": frame, "seconds": frame / meta.fps, "file": f"{frame:06d}.ply"} for frame in frames]
+    first = backgrounds[0] if backgrounds else meta.background
+    files = [
+        {"frame": frame, "seconds": frame / meta.fps, "file": f"{frame:06d}.ply"}
+        | ({} if behind == first else {"background": list(behind)})  # a lamp was switched
+        for frame, behind in zip(frames, backgrounds, strict=True)
+    ]
     data = {
         "format": "3DGS PLY, one file per frame",
         "fps": meta.fps,
-        "background": list(meta.background),
+        "background": list(first),
         "viewmat": "world to camera, OpenCV axes",
         "frames": files,
         "cameras": cameras,

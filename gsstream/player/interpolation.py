@@ -47,6 +47,12 @@ class Moments:
         self._before: PlayerState | None = None
         self._after: PlayerState | None = None
 
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """What is behind the scene that was asked for last; colours between two frames are those of the first."""
+        assert self._before is not None, "no scene was asked for"
+        return self._before.meta.background
+
     def at(self, time: float) -> Gaussians[FloatArray]:
         """Return the scene at a time, in frames; after the last frame, that of the last.
 

@@ -132,14 +132,15 @@ def _images(
     renderer: PlayerRenderer | None,
     progress: Callable[[int, int], None] | None,
 ) -> Iterator[Bytes]:
-    background, scenes = playback.meta.background, Moments(playback)
+    scenes = Moments(playback)
     last: tuple[object, int, FloatArray] | None = None
     for i, time in enumerate(times):
         scene, view = scenes.at(time), min(i, len(cameras) - 1)
         # An empty packet keeps the very same scene object: nothing has to be rendered again.
         if last is None or last[0] is not scene or last[1] != view:
             scale = float(cameras.Ks[view, 0, 0]) / recorded
-            last = (scene, view, render(scene, cameras, view, background=background, renderer=renderer, scale=scale))
+            behind = scenes.background
+            last = (scene, view, render(scene, cameras, view, background=behind, renderer=renderer, scale=scale))
         yield to_bytes(last[2])
         if progress is not None:
             progress(i + 1, len(times))

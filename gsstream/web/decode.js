@@ -4,7 +4,7 @@ import { copied as motionCopy, decodeMotions, unionRows, SECTIONS as MOTION } fr
 import { applyResidual, decodeResidual, SECTIONS as RESIDUAL } from "./changes/residual.js";
 import { applyRows, decodeRows, SECTIONS as ROWS } from "./changes/rows.js";
 import { KIND, parsePacket } from "./container.js";
-import { PacketError, located, ofSection } from "./errors.js";
+import { PacketError, located } from "./errors.js";
 import { displacementBetween, gatherDisplacement, gatherGroups, gatherValues } from "./history.js";
 import { decodeKey, later } from "./key.js";
 
@@ -15,7 +15,7 @@ import { decodeKey, later } from "./key.js";
  * is decoded as a whole first, so after a PacketError the state still is that of the frame before.
  *
  * A state has `frame`, `number` (Gaussians), `scene` (attribute -> Float32Array), `widths` (values a row), `layout`,
- * `meta`, `background` (in the light of the frame), `decoders`, `groups` and `displacement` (for the next packet),
+ * `meta`, `background` (that of the meta until there is a light), `decoders`, `groups` and `displacement` (for the next packet),
  * `turned` (whether a motion or a light was since the key packet), `spare` (memory for motions), and `change`: what this packet changed, for the view.
  */
 export function decodePacket(state, data, offset = 0) {
@@ -46,8 +46,7 @@ function keyState(header, sections, size, offset) {
 export function firstState(frame, number, { scene, layout, meta, rest }) {
   const widths = { means: 3, quats: 4, scales: 3, opacities: 1, sh0: 3, shN: rest };
   const before = { decoders: new Map(), groups: null, displacement: null, turned: false, spare: null };
-  const { background } = meta;
-  return { frame, number, scene, widths, layout, meta, background, ...before, change: { kind: "key" } };
+  return { frame, number, scene, widths, layout, meta, ...before, change: { kind: "key" } };
 }
 
 /** Sections of a delta packet in their order. */
@@ -60,17 +59,16 @@ function decodeDelta(found, state, offset) {
   if (!places.length || places.some((place, i) => place < 0 || place < places[i - 1])) {
     throw new PacketError(`delta packet: sections ${names.join(", ") || "none"} do not stand in this order`, offset);
   }
-  const lit = ofSection(light, (data) => later.light(data, state));
-  // Motions form groups by brightness. What they copy of this state is not the memory that the other one keeps.
-  if (lit) state = { ...state, scene: { ...state.scene, ...lit }, spare: null };
-  let motions = motion ? located(motion.offset, () => decodeMotions(motion, state)) : null;
+  const lit = light && located(light.offset, () => later.light(light.data, state));
+  if (lit) state = lit.state;
+  let motions = motion && located(motion.offset, () => decodeMotions(motion, state));
   if (field) {
     motions ??= { ...motionCopy(state), groups: state.groups, rows: [] };
     motions = located(field.offset, () => later.field(field, motions));
   }
   const stray = names.find((name) => RESIDUAL.includes(name));
   if (stray && !found.gates) throw new PacketError(`delta packet: section ${stray} without gates`, found[stray].offset);
-  const residual = found.gates ? decodeResidual(found, state, offset) : null;
+  const residual = found.gates && decodeResidual(found, state, offset);
   const rows = found.removed || found.added ? decodeRows(found, state, offset) : null;
   return { lit, motions, residual, rows };
 }
@@ -84,12 +82,7 @@ function applyDelta(state, { lit, motions, residual, rows }) {
   const means = gatherValues(state.scene.means, touched, 3);
   const quats = gatherValues(state.scene.quats, touched, 4);
   const change = { kind: "delta", moved: [], source: null, before: state.number };
-  if (lit) {
-    const { sh0, shN, background } = lit;
-    Object.assign(state.scene, { sh0, shN });
-    Object.assign(state, { background, turned: true });
-    change.moved.push({ rows: Uint32Array.from(state.scene.opacities.keys()), gate: null, attributes: ["sh0", "shN"] });
-  }
+  lit?.apply(state, change);
   if (motions) {
     const { means, quats } = state.scene;
     state.spare = { means, quats, rows: touched };

@@ -42,8 +42,7 @@ export function decodeJoin(key, data) {
   const groups = facts.groups && { ...facts.groups, groupOf: body.steps(number) };
   const displacement = facts.displaced === null ? null : body.displacement(facts.displaced);
   const change = { kind: "key" };
-  const background = facts.background ?? key.background;
-  return { ...key, background, frame, number, scene, layout, decoders, groups, displacement, turned: true, change };
+  return { ...key, background: facts.background, frame, number, scene, layout, decoders, groups, displacement, turned: true, change };
 }
 
 /** The values of one attribute: those of the key packet, plus differences of their bits. */

@@ -11,8 +11,8 @@ import { parseMeta } from "./meta.js";
 import { decodeSymbols, within } from "./symbols.js";
 import { decompress } from "./vendor/fzstd.js";
 
-/** What decodes these sections, once its module is loaded. */
-export const later = { layers: null, field: null, light: null };
+/** What decodes the sections layers, field and light, by their names, once its module is loaded. */
+export const later = {};
 
 /**
  * Decode the sections of a key packet of `size` bytes at `offset`: `{ scene, layout, meta, rest }`, where `rest` is how

@@ -99,9 +99,6 @@ function piecesOf(segment, entry, base) {
   }));
 }
 
-/** What decodes sections that are rare, by their numbers. */
-const MODULES = { 10: () => import("./changes/field.js"), 13: () => import("./changes/light.js") };
-
 /**
  * Packets `{ data, offset, header }` of a segment as they arrive. `onPart` gets the walker while it holds a part of
  * a packet with layers. Throws PacketError or SourceError.
@@ -116,7 +113,10 @@ export async function* packetsOf(segment, signal, onPart) {
     walker ??= make();
     walker.push(chunk);
     for (let packet = walker.next(); packet; packet = walker.next()) {
-      for (const number of sectionsOf(packet.data)) await MODULES[number]?.();
+      for (const section of sectionsOf(packet.data)) {
+        if (section === 10) await import("./changes/field.js");
+        if (section === 13) await import("./changes/light.js");
+      }
       yield packet;
     }
     // Section 11, which begins a packet, are layers.

@@ -164,7 +164,7 @@ export class Stream {
   }
 
   _send(name, state, more) {
-    const { frame, number, meta, background } = state;
+    const { frame, number, meta, background = meta.background } = state;
     const { update, transfer } = this.packer.pack(state);
     const told = meta === this.meta ? undefined : meta;
     this.meta = meta;

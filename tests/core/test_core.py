@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsstream.core.cameras import Cameras
-from gsstream.core.changes import Delta, Layout, Motion, Residual, RowEdit, Scene, apply_delta, sent_rows
+from gsstream.core.changes import Delta, Layout, Light, Motion, Residual, RowEdit, Scene, apply_delta, sent_rows
 from gsstream.core.errors import (
     ComponentError,
     GsstreamError,
@@ -307,27 +307,33 @@ class TestDelta:
             (Residual, Residual),
             (RowEdit, RowEdit),
             (Motion, RowEdit, Motion),
+            (Motion, Light),
+            (Light, Light),
         ],
     )
     def test_changes_in_another_order_are_refused(self, kinds: tuple[type, ...]) -> None:
         some = {
+            Light: Light((2.0, 1.0, 0.5)),
             Motion: Motion(1.0, 1, np.zeros(1, np.uint8), np.zeros((0, 6), np.int32)),
             Residual: self.delta().residual,
             RowEdit: RowEdit(removed=np.array([0])),
         }
         names = ", ".join(kind.__name__ for kind in kinds)
-        wanted = f"motions, then one field, then one residual, then one change of rows; got {names}"
+        wanted = f"one light, then motions, then one field, one residual and one change of rows, got {names}"
         with pytest.raises(ShapeError, match=wanted):
             Delta(tuple(some[kind] for kind in kinds))
 
     def test_a_residual_or_rows_are_exchanged_in_their_place(self) -> None:
-        motion = Motion(1.0, 1, np.zeros(1, np.uint8), np.zeros((0, 6), np.int32))
+        light, motion = Light((2.0, 1.0, 0.5)), Motion(1.0, 1, np.zeros(1, np.uint8), np.zeros((0, 6), np.int32))
         residual, rows = self.delta().residual, RowEdit(removed=np.array([0]))
-        whole = Delta((motion, motion, residual, rows))
-        assert Delta((motion, motion)).with_row_edit(rows).with_residual(residual).changes == whole.changes
-        assert whole.with_residual(None).changes == (motion, motion, rows)
-        assert whole.with_row_edit(RowEdit()).changes == (motion, motion, residual)
-        assert (whole.motions, whole.residual, whole.row_edit) == ((motion, motion), residual, rows)
+        whole = Delta((light, motion, motion, residual, rows))
+        others = Delta((motion, motion)).with_row_edit(rows)
+        assert others.with_residual(residual).with_light(light).changes == whole.changes
+        assert others.with_light(light).with_residual(residual).changes == whole.changes
+        assert whole.with_residual(None).changes == (light, motion, motion, rows)
+        assert whole.with_row_edit(RowEdit()).changes == (light, motion, motion, residual)
+        assert whole.with_light(None).changes == whole.with_light(Light((1.0, 1.0, 1.0))).changes == whole.changes[1:]
+        assert (whole.light, whole.motions, whole.residual, whole.row_edit) == (light, (motion, motion), residual, rows)
         assert whole.with_residual(None).gates(self.layout()).tolist() == [0, 0, 0]
 
     def test_rows_do_not_depend_on_their_neighbours(self) -> None:

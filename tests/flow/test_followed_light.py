@@ -53,6 +53,11 @@ def followed(out: Path) -> list[int]:
     return [line["frame"] for line in metrics(out) if "light_bytes" in line]
 
 
+def switched(out: Path) -> dict[int, list[float]]:
+    """Frames in which a lamp was switched, and its factor."""
+    return {line["frame"]: line["light"] for line in metrics(out) if "light" in line}
+
+
 def quality(out: Path, frames: slice) -> float:
     return float(np.mean([value for line in metrics(out)[frames] for value in line["psnr"].values()]))
 
@@ -66,10 +71,10 @@ def test_light_that_falls_is_asked_about_every_fifth_frame_and_costs_no_quality(
     assert quality(follows, slice(16, 26)) > quality(stays, slice(16, 26)) - 0.05
 
 
-@pytest.mark.parametrize("scene", ["paths", "flash", "lamp"])
-def test_no_byte_is_sent_for_light_that_stays_or_jumps(rooms: Rooms, scene: str) -> None:
-    stays, follows = rooms.run(scene, 0), rooms.run(scene)
+def test_no_byte_is_sent_for_light_that_stays(rooms: Rooms) -> None:
+    stays, follows = rooms.run("paths", 0), rooms.run("paths")
     assert followed(follows) == []
+    assert switched(follows) == {}
     assert later_packets(follows) == later_packets(stays)
 
 
@@ -84,18 +89,41 @@ def test_light_falls_on_a_scene_in_which_nothing_moves(rooms: Rooms) -> None:
     assert quality(follows, slice(20, 26)) > quality(follows, slice(0, 1)) - 0.3
 
 
-def test_after_a_flash_the_picture_is_what_it_was(rooms: Rooms) -> None:
-    """Frame 1 is lit; from frame 2 on it is as good as where no flash was."""
+def test_a_flash_is_met_in_its_frame_and_afterwards_the_picture_is_what_it_was(rooms: Rooms) -> None:
+    """Frame 1 is 1.6 times as bright: at the same relative error it has so many dB less. Some pixels are cut off."""
     flash, paths = rooms.run("flash"), rooms.run("paths")
-    assert quality(flash, slice(1, 2)) < quality(paths, slice(1, 2)) - 3
+    assert list(switched(flash)) == [1, 2]
+    np.testing.assert_allclose(np.prod(list(switched(flash).values()), axis=0), 1.0, atol=0.01)
+    assert quality(flash, slice(1, 2)) > quality(paths, slice(1, 2)) - 20 * np.log10(1.6) - 0.3
     assert quality(flash, slice(2, 26)) > quality(paths, slice(2, 26)) - 0.3
 
 
-def test_a_lamp_takes_a_frame_of_twice_the_bytes_at_most_and_goes_on_being_met(rooms: Rooms) -> None:
-    lamp = rooms.run("lamp")
-    size = list(map(len, later_packets(lamp)))
-    assert size[0] < 2.5 * np.median(size)
-    assert quality(lamp, slice(20, 26)) > quality(lamp, slice(1, 2)) + 0.5
+def test_a_lamp_is_met_in_its_frame_for_eleven_bytes_and_little_more(rooms: Rooms) -> None:
+    lamp, paths, without = rooms.run("lamp"), rooms.run("paths"), rooms.run("lamp", 0)
+    assert list(switched(lamp)) == [1]
+    np.testing.assert_allclose(switched(lamp)[1], 1.3, atol=0.005)
+    assert metrics(lamp)[1]["bytes"]["light"] == 6
+    for frames in (slice(1, 2), slice(1, 26)):
+        assert quality(lamp, frames) > quality(paths, frames) - 20 * np.log10(1.3) - 0.3
+    assert quality(lamp, slice(1, 2)) > quality(without, slice(1, 2)) + 0.5
+    size, usual = list(map(len, later_packets(lamp))), list(map(len, later_packets(paths)))
+    assert size[0] < usual[0] + 1000
+    assert sum(size) < 1.3 * sum(usual)
+
+
+def test_a_lamp_fits_into_any_budget_and_where_nothing_moves_it_is_all_that_is_sent(rooms: Rooms) -> None:
+    still = rooms.run("lamp&static=1")
+    assert list(switched(still)) == [1]
+    assert len(later_packets(still)[0]) < 1000
+    for most in (16, 40):
+        tight = rooms.run("lamp", budget=f"size={most}B")
+        assert list(switched(tight)) == ([1] if most == 40 else [])
+        assert max(map(len, later_packets(tight))) <= most
+        assert most == 16 or quality(tight, slice(1, 2)) > quality(still, slice(1, 2)) - 2
+
+
+def test_one_camera_that_becomes_brighter_is_no_lamp(rooms: Rooms) -> None:
+    assert switched(rooms.run("paths", around="disturbed:drift=cam02@0.3:")) == {}
 
 
 @pytest.mark.parametrize("scene", ["paths", "dim"])

@@ -20,6 +20,7 @@ WORLD = "synthetic:frames=5&views=3&width=32&height=24&supersample=1"
 STILL = f"{WORLD}&static=1"
 DIMMING = "synthetic:scene=dim&event=1&frames=16&views=3&width=48&height=32&supersample=1"
 DRIFTING = "disturbed:drift=cam01@-0.02:" + DIMMING.replace("dim", "paths").replace("views=3", "views=4")
+LAMP = DIMMING.replace("dim", "lamp").replace("event=1", "event=7")
 FOLLOWED = {"stream__light": 0.5}
 SMALL: dict[str, Any] = {
     "stream__epochs": 2,
@@ -61,6 +62,11 @@ def drifts(lines: Lines) -> bool:
     return {5, 10, 15} <= {line["frame"] for line in lines if "camera_drift" in line}
 
 
+def lit_in(frame: int) -> Callable[[Lines], bool]:
+    """Whether that frame alone says that a lamp was switched."""
+    return lambda lines: [line["frame"] for line in lines if "light" in line] == [frame]
+
+
 def stands_still(lines: Lines) -> bool:
     return "empty" in [line["status"] for line in lines]
 
@@ -99,6 +105,19 @@ RUNS: dict[str, Run] = {
     "a camera that drifts, cut between two looks": Run(13, source=DRIFTING, settings=FOLLOWED, shows=drifts),
     "a camera that drifts, cut at a look, key packets before it": Run(
         12, source=DRIFTING, settings={**FOLLOWED, "codec__key_interval": 4}, shows=drifts
+    ),
+    "a lamp, cut at it": Run(7, source=LAMP, settings=FOLLOWED, shows=lit_in(7)),
+    "a lamp between two looks, cut after it": Run(9, source=LAMP, settings=FOLLOWED, shows=lit_in(7)),
+    "a lamp in the first later frame, cut at a look": Run(
+        5, source=LAMP.replace("event=7", "event=1"), settings=FOLLOWED, shows=lit_in(1)
+    ),
+    "a lamp at a key packet, cut after it": Run(
+        9, source=LAMP, settings={**FOLLOWED, "codec__key_interval": 7},
+        shows=lambda lines: lit_in(7)(lines) and lines[7]["status"] == "key",
+    ),
+    "a lamp while the first frame is refined": Run(
+        3, source=LAMP.replace("event=7", "event=2"),
+        settings={**FOLLOWED, "stream__refine_frames": 4, "stream__refine_iterations": 2}, shows=lit_in(2),
     ),
     "growing": Run(4, method="dense", grows=True),
     "growing, with shared gates": Run(4, grows=True),

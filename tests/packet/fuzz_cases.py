@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from packet_scenes import decode_all, make_field_packets, make_moving_packets, make_packets
+from packet_scenes import decode_all, make_field_packets, make_light_packets, make_moving_packets, make_packets
 
 from gsstream.core.gaussians import Gaussians
 from gsstream.packet import EncodedPacket, PacketKind
@@ -45,6 +45,7 @@ def bases() -> list[Base]:
     ]
     packets = [make_packets(**kwargs) for kwargs in settings] + [make_moving_packets(**kwargs) for kwargs in moving]
     packets.append(make_field_packets(seed=28, number=30, nodes=9))
+    packets.append(make_light_packets(seed=30, number=30, nodes=9))
     return [_base(some) for some in packets]
 
 

@@ -1,8 +1,8 @@
 """Write the stored samples of the current format version. Run once per format version; old samples are never rewritten.
 
 ``stream.gss`` has every kind of packet, added and removed Gaussians; ``moving.gss`` has motions: from rest, predicted,
-corrected, of groups formed anew, two in a frame, and added Gaussians after one; ``field.gss`` has fields; ``world.gss``
-lies in other coordinates than its recording; the key packets of ``layers.gss`` have layers.
+corrected, of groups formed anew, two in a frame, and added Gaussians after one; ``field.gss`` has fields; ``light.gss``
+has lights; ``world.gss`` lies in other coordinates than its recording; the key packets of ``layers.gss`` have layers.
 
 Usage: python tests/packet/make_samples.py
 """
@@ -16,6 +16,7 @@ from pathlib import Path
 from packet_scenes import (
     decode_all,
     make_field_packets,
+    make_light_packets,
     make_moving_packets,
     make_packets,
     make_placed_key,
@@ -39,6 +40,7 @@ def main() -> None:
         "moving": make_moving_packets(seed=12, number=30, nodes=9),
         "field": make_field_packets(seed=14, number=30, nodes=9),
         "world": [make_placed_key(seed=13, number=20, nodes=6)],
+        "light": make_light_packets(seed=16, number=30, nodes=9),
         "layers": make_packets(seed=15, number=30, nodes=9, layers=True),
     }
     folder = SAMPLES / FORMAT_VERSION

@@ -14,13 +14,16 @@ from gsstream.core.changes import (
     Field,
     FieldShape,
     Layout,
+    Light,
     Motion,
     Residual,
     RowEdit,
     Scene,
+    apply_light,
     apply_motion,
     field_rows,
     groups_for,
+    sendable_factor,
     sent_rows,
 )
 from gsstream.core.gaussians import Gaussians
@@ -207,6 +210,29 @@ def make_field_packets(seed: int = 0, **sizes: int) -> list[EncodedPacket]:
             delta = Delta((make_field(rng, scene, None, levels=1, layers=1, features=1, base=1, growth=1.0),))
         packets.append(encode_delta(delta, state.layout, state.decoders, frame=frame))
         state = decode_packet(state, packets[-1].data)
+    return packets
+
+
+def make_light_packets(seed: int = 0, **sizes: int) -> list[EncodedPacket]:
+    """Key, then frames with a light: alone, before a motion and a residual, nothing, before rows that come and go."""
+    rng = np.random.default_rng(seed)
+    key = make_key(rng, **sizes)
+    packets = [encode_key(replace(key, meta=replace(key.meta, background=(0.4, 0.1, 0.25))))]
+    state = decode_packet(None, packets[0].data)
+    for frame in range(1, 5):
+        light = Light(sendable_factor(np.exp(rng.normal(size=3))))
+        lit = apply_light(state.scene, light)
+        if frame == 1:
+            delta = Delta((light,))
+        elif frame == 2:
+            delta = Delta((light, make_motion(rng, lit, predicted=False), *make_delta(rng, state.layout).changes))
+        elif frame == 4:
+            delta = Delta((light, make_motion(rng, lit), *make_edit(rng, state).changes))
+        packet = (
+            encode_empty(frame=frame) if frame == 3 else encode_delta(delta, state.layout, state.decoders, frame=frame)
+        )
+        packets.append(packet)
+        state = decode_packet(state, packet.data)
     return packets
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zlib
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -52,7 +53,8 @@ def decode_join(key: PlayerState, data: bytes) -> PlayerState:
         translation, rotation = (cursor.planes(count, 3).view(np.float32) for _ in range(2))
         displacement = Displacement(rows, translation, rotation)
     scene = Scene(Gaussians(**values), layout, displacement, groups)
-    return PlayerState(frame, scene, key.meta, decoders, key_rows=len(key.gaussians))
+    meta = replace(key.meta, background=tuple(facts.get("background", key.meta.background)))
+    return PlayerState(frame, scene, meta, decoders, key_rows=len(key.gaussians))
 
 
 class _Cursor:

@@ -9,12 +9,15 @@ from gsstream.core.changes import (
     AddedGaussians,
     Delta,
     Layout,
+    Light,
     Motion,
     Residual,
     RowEdit,
     Scene,
+    apply_light,
     apply_motion,
     groups_for,
+    sendable_factor,
 )
 from gsstream.core.changes.residual import sent_rows
 from gsstream.core.gaussians import Gaussians
@@ -84,16 +87,20 @@ def make_rows(rng: np.random.Generator, scene: Scene, sh_rest: int) -> RowEdit:
 
 
 def make_delta(rng: np.random.Generator, scene: Scene, sh_rest: int) -> Delta:
-    """Zero to three motions, perhaps a residual, perhaps rows; at least one of them."""
-    changes: list[Motion | Residual | RowEdit] = []
+    """Perhaps a light, zero to three motions, perhaps a residual, perhaps rows; at least one but the light."""
+    changes: list[Light | Motion | Residual | RowEdit] = []
     after = scene
+    if rng.random() < 0.4:
+        changes.append(Light(sendable_factor(np.exp(0.5 * rng.normal(size=3)))))
+        after = apply_light(scene, changes[0])
     for _ in range(int(rng.integers(0, 4))):
         cell, brightness_bins = [(0.5, 1), (0.5, 1), (0.25, 4)][int(rng.integers(3))]
-        changes.append(make_motion(rng, after, cell, brightness_bins))
-        after = apply_motion(after, changes[-1])[0]
+        motion = make_motion(rng, after, cell, brightness_bins)
+        changes.append(motion)
+        after = apply_motion(after, motion)[0]
     if rng.random() < 0.7:
         changes.append(make_residual(rng, scene.layout))
-    if rng.random() < 0.5 or not changes:
+    if rng.random() < 0.5 or not changes or (len(changes) == 1 and isinstance(changes[0], Light)):
         changes.append(make_rows(rng, scene, sh_rest))
     return Delta(tuple(changes))
 

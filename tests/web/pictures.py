@@ -24,5 +24,6 @@ def decoded(text: str, width: int, height: int) -> np.ndarray:
 def drawn(playback: Playback, frame: int, background: tuple[float, float, float] | None = None) -> np.ndarray:
     """A frame from the first test camera by the player's reference renderer, 8 bits."""
     renderer = PlayerRenderer("numpy", render_numpy)
-    colour = playback.meta.background if background is None else background
-    return to_bytes(render(playback.state_at(frame), playback.cameras("test"), 0, colour, renderer))
+    scene = playback.state_at(frame)
+    colour = playback.meta.background if background is None else background  # in the light of this frame
+    return to_bytes(render(scene, playback.cameras("test"), 0, colour, renderer))

@@ -42,6 +42,7 @@ def joined(request):
     sh_rest, number = request.param
     found = joins_of(moving_packets(seed=sh_rest + 1, frames=14, key_at=99, number=number, sh_rest=sh_rest))
     assert len(found[2]) == 13
+    assert len({state.meta.background for state in found[1]}) > 2
     return found
 
 
@@ -52,6 +53,7 @@ def test_a_join_leads_to_the_state_of_its_frame_and_on_to_the_next(joined):
         assert state.frame == frame
         for packet, expected in zip(packets[frame:], states[frame:], strict=True):
             assert digest(state) == digest(expected)
+            assert state.meta.background == expected.meta.background
             if packet is not packets[-1]:
                 state = decode_packet(state, packets[state.frame + 1].data)
 

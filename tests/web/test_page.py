@@ -13,7 +13,7 @@ from moving_scenes import make_meta, moving_packets
 from pictures import decoded, drawn, psnr
 
 from gsstream.cli.main import run_command
-from gsstream.packet import StreamWriter
+from gsstream.packet import FORMAT_VERSION, StreamWriter
 from gsstream.player.playback import Playback
 from gsstream.serve.package import package
 
@@ -258,22 +258,22 @@ def test_the_page_works_in_a_frame_of_another_page(site, tmp_path):
         in_browser(at(url, [["go", "URL/outer.html"], ["until", inner]]), tmp_path, size=SIZE)
 
 
-@pytest.mark.parametrize("name", ["field", "layers", "world"])
+@pytest.mark.parametrize("name", ["field", "light", "layers", "world"])
 def test_a_field_is_decoded_by_a_module_that_comes_with_it(tmp_path, name):
-    """Each stored stream plays to the state of Python; the decoder of fields is asked for where there are some."""
-    stream = Path(__file__).parents[1] / "packet" / "samples" / "2.3" / f"{name}.gss"
+    """Each stored stream plays to the state of Python; what decodes fields and lights is asked for where some are."""
+    stream = Path(__file__).parents[1] / "packet" / "samples" / FORMAT_VERSION / f"{name}.gss"
     package(stream, tmp_path / "site")
     with Playback(stream) as playback:
         last = playback.frames[-1]
-        means = playback.state_at(last).means.ravel()
-    found = f"{PLAYER}.scene().then(({{ means }}) => Array.from(means))"
+        scene = playback.state_at(last)
+    found = f"{PLAYER}.scene().then(({{ means, sh0 }}) => [...means, ...sh0])"
     seek, wait = ["evaluate", f"{PLAYER}.seek({last})"], ["until", f"{PLAYER}.frame === {last}"]
     steps = [["go", "URL/index.html"], READY, seek, wait, ["evaluate", found]]
     with serving(tmp_path / "site") as (url, server):
         results = in_browser(at(url, steps), tmp_path, size=SIZE)
         asked = {path.removeprefix("/").removesuffix(".js") for path, _ in server.requests}
-    assert np.array_equal(np.float32(results[-1]), means)
-    assert ("changes/field" in asked) == (name == "field")
+    assert np.array_equal(np.float32(results[-1]), np.concatenate([scene.means.ravel(), scene.sh0.ravel()]))
+    assert [part for part in ("field", "light") if f"changes/{part}" in asked] == [name] * (name in ("field", "light"))
 
 
 def test_the_page_is_small(site):
@@ -282,10 +282,10 @@ def test_the_page_is_small(site):
     folder = Path(__file__).parents[2] / "gsstream" / "web"
     files = [p.relative_to(folder) for p in folder.rglob("*") if p.is_file() and "vendor" not in p.parts]
     sizes = {str(name): len(gzip.compress((site / name).read_bytes())) for name in files}
-    # What only a live stream takes, a seek by a join, a stream without a package, a packet with a field, a headset and
-    # the statistics is loaded only there.
-    names = ("live", "live-socket", "live-parts", "latency", "joins", "file", "statistics", "xr", "changes/field")
-    later = [sizes.pop(f"{name}.js") for name in names]
+    # What only a live stream takes, a seek by a join, a stream without a package, a packet with a field or a light, a
+    # headset and the statistics is loaded only there.
+    names = ("live", "live-socket", "live-parts", "latency", "joins", "file", "statistics", "xr")
+    later = [sizes.pop(f"{name}.js") for name in (*names, "changes/field", "changes/light")]
     assert len(sizes) > 20
     assert sum(sizes.values()) <= 60_000
     assert sum(later) <= 13_200

@@ -39,7 +39,8 @@ class Delta:
         if ranks != sorted(ranks) or max(map(ranks.count, (0, 2, 3, 4))) > 1:
             names = ", ".join(type(change).__name__ for change in self.changes)
             raise ShapeError(
-                f"delta: expected one light, then motions, then one field, one residual and one change of rows; got {names}"
+                f"delta: expected one light, then motions, then one field, one residual and one change of rows, got "
+                f"{names}"
             )
 
     @property

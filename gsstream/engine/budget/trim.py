@@ -70,7 +70,8 @@ def trim_to_size(
         plain = trim_to_size(rest, encode(rest), curvature, layout=layout, encode=encode, max_bytes=max_bytes)
         return replace(plain, whole=delta, untrimmed=untrimmed)
     if found is None:
-        found = Delta(), encode(Delta())
+        rest = Delta().with_light(delta.light)
+        found = rest, encode(rest)
     assert len(found[1].data) <= max_bytes, "an empty packet is above the budget"
     return TrimmedDelta(*found, delta, untrimmed, layout)
 

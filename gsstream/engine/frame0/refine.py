@@ -17,6 +17,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from gsstream.core.changes import Scene, apply_light
 from gsstream.core.changes.rows import gather_rows
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import ATTRIBUTES, Gaussians
@@ -148,10 +149,12 @@ def advance_refinement(
     """Return the refinement after a frame: moved as the stream moved, and optimised on the frame's pictures."""
     stream = assembly.recipe.stream
     last = refinement.iterations + iterations_in(stream, refinement, frame)
-    start = replace(track_motion(refinement, before, after), pace=pace_after(stream, refinement.pace, frame))
+    start = replace(
+        track_motion(_in_light(refinement, after), before, after), pace=pace_after(stream, refinement.pace, frame)
+    )
     if last == start.iterations:
         return start
-    generator = rng.stream("refine", frame.index)
+    generator, assembly = rng.stream("refine", frame.index), replace(assembly, background=after.meta.background)
     pyramid = one_size(_iterations(stream), assembly.recipe.first_frame)
     run = FirstFrameRun(
         start=start.gaussians, levels=start.levels, frame=frame, assembly=assembly, generator=generator, pyramid=pyramid
@@ -174,6 +177,14 @@ def advance_refinement(
         statistics=run.statistics.to(CPU),
         iterations=last,
     )
+
+
+def _in_light(refinement: Refinement, after: PlayerState) -> Refinement:
+    """The refinement in the light of a frame in which a lamp was switched."""
+    if after.delta is None or after.delta.light is None:
+        return refinement
+    scene = Scene(refinement.gaussians.map(lambda value: value.numpy()), after.layout)
+    return replace(refinement, gaussians=apply_light(scene, after.delta.light).gaussians.map(torch.from_numpy))
 
 
 def track_motion(refinement: Refinement, before: PlayerState, after: PlayerState) -> Refinement:

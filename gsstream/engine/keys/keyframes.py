@@ -42,6 +42,7 @@ def key_packet_if_due(assembly: Assembly, step: Step, frame: Frame, tools: Tools
     if refused is not None:
         return _postponed(step, reason, refused, tools)
     # A refined scene was fitted to the pictures of this frame; another may show older ones.
+    assembly = replace(assembly, background=state.player.meta.background)  # a lamp may have been switched in this frame
     made, shown = (refined_key_step, frame) if reason == REFINED else (reencode_as_key, state.previous)
     with tools.log.phase("key"):
         after = made(assembly, state, frame, meta=tools.meta(frame), rng=tools.rng, before=before)
@@ -134,7 +135,7 @@ def _key_step(
     layout = make_layout(hierarchy, levels, anchors)
     # A resumed run must compare the next frame with the picture that this scene shows, which may be the picture of an
     # older frame.
-    meta = replace(meta, extra={**meta.extra, SHOWN: shown})
+    meta = replace(meta, extra={**meta.extra, SHOWN: shown}, background=assembly.background)
     first = first_layer_mask(assembly, gaussians, frame, exposure=state.exposure, rng=rng) if layered else None
     meta = key_meta(meta, first_exposure(state.player.meta), anchors.origin, state.gains)
     after, packet = key_state(

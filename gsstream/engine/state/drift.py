@@ -34,11 +34,18 @@ class Lit(NamedTuple):
         frame: its index.
         pixels: [2, V, h, w, 3] of two grids that share no pixel, as they are stored.
         gains: [V, 3] by which cameras had become brighter then; None: none had.
+        lamps: [3] by which lamps that were switched since have made everything brighter.
     """
 
     frame: int
     pixels: torch.Tensor
     gains: FloatArray | None = None
+    lamps: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    def in_light(self, factor: tuple[float, float, float]) -> Lit:
+        """Return what is known of the frame after a lamp was switched. Pixels are kept, so that a flash loses none."""
+        red, green, blue = (had * more for had, more in zip(self.lamps, factor, strict=True))
+        return self._replace(lamps=(red, green, blue))
 
 
 class Drift(NamedTuple):
@@ -80,6 +87,8 @@ def changes(before: Lit, now: Lit) -> Changes:
     first, then = (
         lit.pixels.to(device).float() * (255.0 if lit.pixels.is_floating_point() else 1.0) for lit in (before, now)
     )
+    if before.lamps != now.lamps:
+        first = (first * first.new_tensor(before.lamps)).clamp_max(255.0)
     # Where no camera drifts, pictures are compared as they are stored, to the bit.
     if now.gains is not before.gains:
         one = np.ones((then.shape[1], 3), np.float32)

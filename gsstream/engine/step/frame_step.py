@@ -1,6 +1,6 @@
 """One later frame of a method made of parts, top to bottom: (StreamState, Frame) -> Step.
 
-what changed -> motion -> confidence, gates -> optimise -> growth -> code -> decode own packet -> next state
+light, what changed -> motion -> confidence, gates -> optimise -> growth -> code -> decode own packet -> next state
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from gsstream.engine.fit.photometric import FrameImages
 from gsstream.engine.state.drift import EVERY
 from gsstream.engine.state.stream_state import Resident, Step, StreamState, next_state, updated
 from gsstream.engine.step.context import EngineContext
+from gsstream.engine.step.lamp import with_lamp
 from gsstream.engine.step.light import Sent, look, relit
 from gsstream.engine.step.metrics import step_numbers
 from gsstream.engine.step.motion import propose_motion
@@ -52,9 +53,10 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
         return empty_step(state, frame, log)
     with log.phase("change"):
         images = FrameImages(frame.images, assembly.renderer.device)
+        had, (assembly, state, light) = state.player, with_lamp(assembly, state, frame, budget.max_bytes, log)
         change = find_change(assembly.renderer, state, images, threshold=budget.change_threshold)
         state, due = (state, False) if state.lit and frame.index % EVERY else look(assembly, state, frame, images, log)
-    if change is not None and change.share == 0 and scope is not Scope.ALL and not due:
+    if change is not None and change.share == 0 and scope is not Scope.ALL and not due and light is None:
         return empty_step(state, frame, log)
     with log.phase("motion"), deferred_checks(assembly.checks is not Checks.STEP):
         motions, scene, work = propose_motion(assembly, state, frame, change=change, tools=tools, images=images)
@@ -83,24 +85,23 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
     with log.phase("growth"):
         delta = with_growth(assembly, state, Delta(motions).with_residual(residual), work=work, rng=rng)
     with log.phase("code"):
-        trim, most = assembly.recipe.codec.trim, budget.max_bytes
-        fitted = encode_frame(delta, state.player, frame.index, solution=solution, trim=trim, max_bytes=most)
-        sent = Sent(fitted.delta, fitted.packet, decode_packet(state.player, fitted.packet.data), state.lit)
+        trim, most, delta = assembly.recipe.codec.trim, budget.max_bytes, delta.with_light(light)
+        fitted = encode_frame(delta, had, frame.index, solution=solution, trim=trim, max_bytes=most)
+        sent = Sent(fitted.delta, fitted.packet, decode_packet(had, fitted.packet.data), state.lit)
     if due:
         with log.phase("optimise/light"):
-            sent = relit(assembly, state, work, sent, max_bytes=most)
+            sent = relit(assembly, replace(state, player=had), work, sent, max_bytes=most)
     with log.phase("keep"):
         # A frame that changed nothing is not what the scene shows: the next one is compared with the last that did, so
         # that a change too slow to see from frame to frame adds up until it is seen.
-        unchanged = sent.delta.is_empty
-        shown = state.previous if unchanged else replace(frame, images=packed(frame.images))
+        shown = state.previous if sent.delta.is_empty else replace(frame, images=packed(frame.images))
         session, resident = keep(work, scene, sent.delta, sent.player)
         kept = replace(state, previous=shown, session=session, resident=resident, lit=sent.lit)
         after = next_state(assembly.motion, kept, sent.player, rng)
     log.set(changed_tiles=1.0 if change is None else change.share, **step_numbers(solution, len(rows), session))
     if (schedule.timed or schedule.sized) and (len(rows) or scope is Scope.NONE):
         log.set(budget=schedule.usage(fitted))
-    return Step(after, replace(sent.packet, decoded=sent.player), "empty" if unchanged else "delta")
+    return Step(after, replace(sent.packet, decoded=sent.player), "empty" if sent.delta.is_empty else "delta")
 
 
 def find_change(renderer: Renderer, state: StreamState, images: FrameImages, threshold: float) -> Change | None:

@@ -7,12 +7,16 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from many_streams import play_all
 
+from gsstream.packet import FORMAT_VERSION
 from gsstream.packet.conformance import judge, load_cases, play_here, play_with
+from gsstream.player.playback import Playback
 
 HERE = Path(__file__).parent
 SOURCES = sorted((HERE.parent / "src" / "c").glob("*.c"))
@@ -96,6 +100,19 @@ def test_a_stream_of_a_real_run(dump: Path, tmp_path: Path, method: str) -> None
     expected = play_here(stream)
     assert len(expected.lines) == 2
     assert play_with([str(dump)])(stream) == expected
+
+
+def test_the_background_follows_the_light(tmp_path: Path) -> None:
+    """The hash of a frame has no background in it; the info program prints those that are new."""
+    info = build(tmp_path / "gss_info", source("gss_info"), ["-O2"])
+    stream = SUITE.parent / "packet" / "samples" / FORMAT_VERSION / "light.gss"
+    done = subprocess.run([info, stream], capture_output=True, text=True, timeout=60, check=True)
+    said = [line.partition(", background ")[2].split() for line in done.stdout.splitlines()[1:] if "background" in line]
+    with Playback(stream) as playback:
+        known = [playback.player_state(frame).meta.background for frame in playback.frames]
+    new = [now for before, now in pairwise(known) if before != now]
+    assert len(new) == 3
+    assert np.array_equal(np.array(said, np.float32), np.array(new, np.float32))
 
 
 def test_every_file_is_short_and_the_info_program_builds(tmp_path: Path) -> None:

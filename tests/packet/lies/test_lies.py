@@ -8,6 +8,7 @@ import pytest
 from delta_lies import residual_victim, row_victim
 from field_lies import field_victim
 from key_lies import key_victim, meta_victim
+from light_lies import light_victim
 from motion_lies import motion_victim
 from packet_scenes import replaced
 
@@ -15,7 +16,15 @@ from gsstream.core.errors import PacketError
 from gsstream.packet import PlayerState, decode_packet
 from gsstream.packet.base import parse_packet
 
-VICTIMS = (key_victim(), meta_victim(), residual_victim(), motion_victim(), field_victim(), row_victim())
+VICTIMS = (
+    key_victim(),
+    meta_victim(),
+    residual_victim(),
+    motion_victim(),
+    field_victim(),
+    row_victim(),
+    light_victim(),
+)
 # Made here, not in the test: under the count of memory they would take several times as long.
 LIES = [
     pytest.param(victim.state, replaced(victim.packet, section, data), section, message, id=f"{section}: {name}")

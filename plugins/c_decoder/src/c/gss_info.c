@@ -3,6 +3,7 @@
 
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 
 static void *read_file(const char *path, size_t *size)
 {
@@ -28,6 +29,7 @@ int main(int count, char **words)
         return 2;
     }
     unsigned long frames = 0;
+    float background[3] = {0};
     int found;
     while ((found = gss_next(stream)) == GSS_FRAME) {
         const gss_frame *frame = gss_state(stream);
@@ -35,10 +37,15 @@ int main(int count, char **words)
             const gss_meta_info *meta = gss_meta(stream);
             printf("%.6g frames a second, %lu cameras, background %.3g %.3g %.3g\n", meta->fps,
                    (unsigned long)meta->cameras, meta->background[0], meta->background[1], meta->background[2]);
+            memcpy(background, meta->background, sizeof background);
         }
-        printf("frame %lu: %lu Gaussians in %lu nodes, %lu harmonics%s\n", (unsigned long)frame->frame,
+        printf("frame %lu: %lu Gaussians in %lu nodes, %lu harmonics%s", (unsigned long)frame->frame,
                (unsigned long)frame->rows, (unsigned long)frame->nodes, (unsigned long)frame->harmonics,
                frame->displaced ? ", some moved" : "");
+        if (memcmp(background, frame->background, sizeof background))
+            printf(", background %.9g %.9g %.9g", frame->background[0], frame->background[1], frame->background[2]);
+        printf("\n");
+        memcpy(background, frame->background, sizeof background);
     }
     printf("%lu frames%s%s\n", frames, found < 0 ? ", then: " : "", found < 0 ? gss_error(stream)->message : "");
     gss_close(stream);

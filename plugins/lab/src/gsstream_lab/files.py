@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -48,7 +49,7 @@ class PlySequence:
 
     def __init__(self, folder: Path, info: SourceInfo, first: int, background: tuple[float, float, float]) -> None:
         self._files, self._info = numbered(folder, (".ply",), first), info
-        self._background = _background(folder, background)
+        self._backgrounds = _backgrounds(folder, background)
         self._with = find_renderer()
         self._last: tuple[int, Gaussians[FloatArray]] | None = None
         self.rig, self.renderer, self.frames = info.test, self._with.name, _in_recording(self._files, info)
@@ -60,10 +61,8 @@ class PlySequence:
     def images(self, frame: int) -> list[FloatArray]:
         """Return what the test cameras see of a frame."""
         scene, views = self._scene(frame), range(len(self.rig))
-        return [
-            np.clip(render(scene, self.rig, view, background=self._background, renderer=self._with), 0, 1)
-            for view in views
-        ]
+        behind = self._backgrounds.get(self._files[frame].name, self._backgrounds[""])
+        return [np.clip(render(scene, self.rig, view, background=behind, renderer=self._with), 0, 1) for view in views]
 
     def seen(self, frame: int) -> list[BoolArray]:
         """Return the pixels of the test cameras whose surface the recording's training cameras see."""
@@ -157,13 +156,24 @@ def _in_recording(files: dict[int, Path], info: SourceInfo) -> tuple[int, ...]:
     return tuple(files)
 
 
-def _background(folder: Path, usual: tuple[float, float, float]) -> tuple[float, float, float]:
-    """The background that ``sequence.json`` names, which ``gsstream export`` writes; else the usual one."""
+def _backgrounds(folder: Path, usual: tuple[float, float, float]) -> dict[str, tuple[float, float, float]]:
+    """The background that ``sequence.json`` names, which ``gsstream export`` writes, else the usual one, as that of "".
+
+    Those of files that have another one, where a lamp was switched, are told by the names of the files.
+    """
     path = folder / "sequence.json"
     if not path.is_file():
-        return usual
+        return {"": usual}
     try:
-        red, green, blue = (float(value) for value in json.loads(path.read_text(encoding="utf-8"))["background"])
+        said = json.loads(path.read_text(encoding="utf-8"))
+        others = {
+            entry["file"]: _colour(entry["background"]) for entry in said.get("frames", []) if "background" in entry
+        }
+        return {"": _colour(said["background"]), **others}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: expected an entry background of three numbers: {error!r}") from error
+
+
+def _colour(value: list[Any]) -> tuple[float, float, float]:
+    red, green, blue = (float(part) for part in value)
     return red, green, blue

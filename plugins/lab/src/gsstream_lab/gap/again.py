@@ -99,7 +99,9 @@ def measure_again(
         for frame, scene in playback:
             now, views = changed[pictures[len(values)]], list[list[float]]()
             for i, truth in enumerate(source.frame(frame, "test").images):
-                image = np.clip(render(scene, meta.test, i, background=meta.background, renderer=renderer), 0, 1)
+                image = np.clip(
+                    render(scene, meta.test, i, background=playback.meta.background, renderer=renderer), 0, 1
+                )
                 views.append([psnr(image, truth, mask) for mask in (None, ~ever[i], ever[i] & ~now[i], now[i])])
             values.append([mean(column) for column in zip(*views, strict=True)])
             if progress is not None:

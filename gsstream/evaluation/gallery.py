@@ -21,6 +21,8 @@ from gsstream.player.playback import Playback
 STREAM, METRICS = "stream.gss", "metrics.jsonl"
 SHEET, PLOTS, SUMMARY, VIDEO = "contact_sheet.png", "frames.png", "summary.txt", "video.mp4"
 COLUMNS = 5
+#: Most lamps that a summary names.
+MOST_LAMPS = 6
 NO_FILES: Mapping[int, Path] = MappingProxyType({})
 
 
@@ -57,6 +59,7 @@ def _write_summary(out: Path, meta: StreamMeta, records: Sequence[FrameRecord]) 
     text += ["", later] if (later := later_keys_line(records)) else []
     lines = read_lines(out / METRICS)
     text += ["", drifted] if (drifted := drift_line(lines, meta.train.ids)) else []
+    text += ["", lit] if (lit := lamp_line(lines)) else []
     if lines[0].get("blank_views") == len(meta.train):
         text += [
             "",
@@ -66,6 +69,17 @@ def _write_summary(out: Path, meta: StreamMeta, records: Sequence[FrameRecord]) 
         text += ["", *part] if part else []
     (out / SUMMARY).write_text("\n".join(text) + "\n", encoding="utf-8")
     return out / SUMMARY
+
+
+def lamp_line(lines: Sequence[Mapping[str, Any]]) -> str:
+    """Return in which frames a lamp was switched, and its factors of red, green and blue; empty where none was."""
+    found = [
+        f"frame {line['frame']} x {'/'.join(f'{value:.2f}' for value in line['light'])}"
+        for line in lines
+        if "light" in line
+    ]
+    more = f" and {len(found) - MOST_LAMPS} more" if len(found) > MOST_LAMPS else ""
+    return f"everything became brighter or darker at once: {', '.join(found[:MOST_LAMPS])}{more}" if found else ""
 
 
 def drift_line(lines: Sequence[Mapping[str, Any]], cameras: Sequence[str]) -> str:

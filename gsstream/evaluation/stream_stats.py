@@ -173,8 +173,8 @@ def paper_estimate(state: PlayerState, kind: PacketKind) -> float:
     delta, bits = state.delta, 0.0
     residual, gates = delta.residual or Residual(delta.gates(state.before), 1), delta.gates(state.before)
     bits += 32 * sum(decoder.size for decoder in residual.decoders.values())
-    # The paper's method has no motions and no network; by the paper's rule each of their numbers would be a float32.
-    bits += sum(32 * motion.symbols.size for motion in delta.motions)
+    # The paper's method has no motions, no light and no network; by the paper's rule each of their numbers would be a float32.
+    bits += sum(32 * motion.symbols.size for motion in delta.motions) + 96 * (delta.light is not None)
     if delta.field is not None:
         bits += sum(32 * table.size for table in (*delta.field.entries, *delta.field.weights))
     number, rows = len(state.before.unit_of), len(sent_rows(state.before, gates))

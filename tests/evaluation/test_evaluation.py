@@ -22,7 +22,7 @@ from gsstream.engine.run.metrics_log import last_written, trim_metrics
 from gsstream.engine.run.progress import frame_line
 from gsstream.evaluation.contact_sheet import Column, contact_sheet, most_changed_window, sheet_of_stream
 from gsstream.evaluation.evaluate import Evaluation, ViewQuality, evaluate
-from gsstream.evaluation.gallery import drift_line
+from gsstream.evaluation.gallery import drift_line, lamp_line
 from gsstream.evaluation.plots import plot_runs
 from gsstream.evaluation.records import FrameRecord, read_lines, read_records
 from gsstream.evaluation.summary import Summary, fitted, format_table, later_keys_line, summarise, summary_table
@@ -214,6 +214,14 @@ def test_a_camera_that_drifted_is_named_with_its_last_gain() -> None:
     wanted = "cameras that became brighter or darker alone: b -2.0/-2.0/-2.0 %, c +0.0/+0.0/+0.3 %; fix their exposure"
     assert drift_line(lines, ["a", "b", "c"]) == wanted
     assert drift_line(lines[2:], ["a", "b", "c"]) == ""
+
+
+def test_lamps_are_told_by_their_frames_and_not_without_end() -> None:
+    lines = [{"frame": 0}, {"frame": 1, "light": [1.25, 0.5, 1.0]}, {"frame": 2}]
+    assert lamp_line(lines) == "everything became brighter or darker at once: frame 1 x 1.25/0.50/1.00"
+    assert lamp_line(lines[2:]) == ""
+    many = [{"frame": frame, "light": [1.5, 1.5, 1.5]} for frame in range(9)]
+    assert lamp_line(many).endswith("frame 5 x 1.50/1.50/1.50 and 3 more")
 
 
 def test_what_was_not_measured_is_a_dash():

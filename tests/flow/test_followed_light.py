@@ -103,6 +103,7 @@ def test_a_lamp_is_met_in_its_frame_for_eleven_bytes_and_little_more(rooms: Room
     assert list(switched(lamp)) == [1]
     np.testing.assert_allclose(switched(lamp)[1], 1.3, atol=0.005)
     assert metrics(lamp)[1]["bytes"]["light"] == 6
+    assert "at once: frame 1 x 1.30/1.30/1.30" in (lamp / "summary.txt").read_text()
     for frames in (slice(1, 2), slice(1, 26)):
         assert quality(lamp, frames) > quality(paths, frames) - 20 * np.log10(1.3) - 0.3
     assert quality(lamp, slice(1, 2)) > quality(without, slice(1, 2)) + 0.5

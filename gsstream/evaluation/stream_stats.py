@@ -173,7 +173,7 @@ def paper_estimate(state: PlayerState, kind: PacketKind) -> float:
     delta, bits = state.delta, 0.0
     residual, gates = delta.residual or Residual(delta.gates(state.before), 1), delta.gates(state.before)
     bits += 32 * sum(decoder.size for decoder in residual.decoders.values())
-    # The paper's method has no motions, no light and no network; by the paper's rule each of their numbers would be a float32.
+    # The paper's method has no motions, light or network; by the paper's rule each of their numbers would be a float32.
     bits += sum(32 * motion.symbols.size for motion in delta.motions) + 96 * (delta.light is not None)
     if delta.field is not None:
         bits += sum(32 * table.size for table in (*delta.field.entries, *delta.field.weights))

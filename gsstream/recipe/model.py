@@ -130,7 +130,7 @@ class Stream(Section):
         le=100,
         description="grey levels of 255 by which a third of what stands still must have drifted since its colours last "
         "followed the light; then all colours that stand still are compared with the images. A camera that drifts so "
-        "far from most others gets a gain of its own, and a lamp that is switched a factor for the whole scene. 0: none",
+        "far from most others gets a gain of its own, a lamp that is switched a factor for the whole scene. 0: none",
     )
     refine_frames: int = Field(
         default=0,

@@ -64,6 +64,13 @@ def test_the_factor_is_found_to_half_a_percent_and_in_noise_to_more(
     assert found(before, now, light=0.0) is None
 
 
+def test_a_channel_that_is_dark_takes_the_factor_of_the_others() -> None:
+    """Of a room in amber light: it has hardly any blue."""
+    amber = room() * np.array([1, 0.6, 0.03], np.float32)
+    np.testing.assert_allclose(found(amber, amber * np.float32(1.3)), 1.3, rtol=0.005)
+    assert found(room(), room() * np.array([1, 1, 0.02], np.float32)) is None
+
+
 def moved(share: float) -> FloatArray:
     """The room, in which other things stand in a share of every picture."""
     images, other = room(), room(9)

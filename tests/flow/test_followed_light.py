@@ -123,6 +123,22 @@ def test_a_lamp_fits_into_any_budget_and_where_nothing_moves_it_is_all_that_is_s
         assert most == 16 or quality(tight, slice(1, 2)) > quality(still, slice(1, 2)) - 2
 
 
+def test_a_light_that_comes_and_goes_costs_nothing_of_what_moves(rooms: Rooms) -> None:
+    """Regression: of a packet whose residual was cut by a share, nothing but the factor was left."""
+    swings, paths = rooms.run("paths", around="disturbed:gain_amplitude=0.4:"), rooms.run("paths")
+    assert len(switched(swings)) > 10
+    assert min(map(len, later_packets(swings))) > 100
+    assert sum(map(len, later_packets(swings))) < 1.5 * sum(map(len, later_packets(paths)))
+
+
+def test_what_does_not_fit_beside_a_factor_is_tried_again_in_the_next_frame(rooms: Rooms) -> None:
+    """Regression: a frame that sent nothing else counted as shown."""
+    tight = rooms.run("stop", around="disturbed:gain_amplitude=0.4:", budget="size=40B")
+    assert switched(tight)
+    shares = [line["changed_tiles"] for line in metrics(tight)[8:]]
+    assert min(shares) > 0.05
+
+
 def test_one_camera_that_becomes_brighter_is_no_lamp(rooms: Rooms) -> None:
     assert switched(rooms.run("paths", around="disturbed:drift=cam02@0.3:")) == {}
 

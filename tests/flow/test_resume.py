@@ -115,6 +115,12 @@ RUNS: dict[str, Run] = {
         9, source=LAMP, settings={**FOLLOWED, "codec__key_interval": 7},
         shows=lambda lines: lit_in(7)(lines) and lines[7]["status"] == "key",
     ),
+    "a lamp in a still room, cut after it": Run(
+        9, source=LAMP + "&static=1", settings=FOLLOWED, shows=lambda lines: lit_in(7)(lines) and stands_still(lines)
+    ),
+    "a lamp in a still room, key packets after it": Run(
+        11, source=LAMP + "&static=1", settings={**FOLLOWED, "codec__key_interval": 5}, shows=lit_in(7)
+    ),
     "a lamp while the first frame is refined": Run(
         3, source=LAMP.replace("event=7", "event=2"),
         settings={**FOLLOWED, "stream__refine_frames": 4, "stream__refine_iterations": 2}, shows=lit_in(2),

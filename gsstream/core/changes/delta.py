@@ -84,6 +84,11 @@ class Delta:
         return all(change.is_empty for change in self.changes)
 
     @property
+    def is_light_at_most(self) -> bool:
+        """Whether nothing but the light changes."""
+        return all(change.is_empty or isinstance(change, Light) for change in self.changes)
+
+    @property
     def has_row_edit(self) -> bool:
         """Whether Gaussians are added or removed."""
         return self.row_edit is not None and not self.row_edit.is_empty

@@ -44,7 +44,7 @@ def read_end(path: Path, last: int | None = None) -> Ended:
             key = player.frame
             # A key packet says which picture its scene shows: it may stand for an older one.
             shown = int(player.meta.extra.get(SHOWN, player.frame))
-        elif kind != PacketKind.EMPTY:
+        elif player.delta is not None and not player.delta.is_light_at_most:
             shown = player.frame
     if player is None:
         raise PacketError("the first key packet of the stream is damaged", 0)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from gsstream.core.changes import AddedGaussians, Layout
+from gsstream.core.changes import AddedGaussians, Layout, Light
 from gsstream.core.frame import Frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.hierarchy import Hierarchy
@@ -71,6 +71,8 @@ class StreamState:
     #: Training images of the last frame whose packet changed the scene: what the scene shows. As bytes
     #: where bytes hold them.
     previous: Frame
+    #: Lamps that were switched since, in whose light ``previous`` is.
+    lamps: tuple[Light, ...] = ()
     #: Linear decoders to continue from; equal to the player's once they were sent.
     decoders: Mapping[str, torch.Tensor] = field(default_factory=dict)
     exposure: Exposure | None = None  # colour maps of the training cameras, or None

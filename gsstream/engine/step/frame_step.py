@@ -92,16 +92,24 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
         with log.phase("optimise/light"):
             sent = relit(assembly, replace(state, player=had), work, sent, max_bytes=most)
     with log.phase("keep"):
-        # A frame that changed nothing is not what the scene shows: the next one is compared with the last that did, so
-        # that a change too slow to see from frame to frame adds up until it is seen.
-        shown = state.previous if sent.delta.is_empty else replace(frame, images=packed(frame.images))
         session, resident = keep(work, scene, sent.delta, sent.player)
-        kept = replace(state, previous=shown, session=session, resident=resident, lit=sent.lit)
+        kept = replace(shown_after(state, frame, sent.delta), session=session, resident=resident, lit=sent.lit)
         after = next_state(assembly.motion, kept, sent.player, rng)
     log.set(changed_tiles=1.0 if change is None else change.share, **step_numbers(solution, len(rows), session))
     if (schedule.timed or schedule.sized) and (len(rows) or scope is Scope.NONE):
         log.set(budget=schedule.usage(fitted))
     return Step(after, replace(sent.packet, decoded=sent.player), "empty" if sent.delta.is_empty else "delta")
+
+
+def shown_after(state: StreamState, frame: Frame, delta: Delta) -> StreamState:
+    """Return the state with the pictures that the scene shows after a frame.
+
+    A frame that changed nothing, or the light alone, is not what the scene shows: the next one is compared with the
+    last that did, so that a change too slow to see from frame to frame adds up until it is seen.
+    """
+    if delta.is_light_at_most:
+        return state
+    return replace(state, previous=replace(frame, images=packed(frame.images)), lamps=())
 
 
 def find_change(renderer: Renderer, state: StreamState, images: FrameImages, threshold: float) -> Change | None:
@@ -189,7 +197,7 @@ def keep(
     is the player's own. Where the frame changed nothing, the scene shows the images that it showed before.
     """
     # Where a delta is empty though something moved, not even the motions were sent.
-    if delta.has_row_edit or (delta.is_empty and scene.gaussians is not player.gaussians):
+    if delta.has_row_edit or (delta.is_light_at_most and scene.gaussians is not player.gaussians):
         return None, None
     rows = sent_rows(scene.layout, delta.gates(scene.layout))
     if len(rows) > MOST_CHANGED * len(player.gaussians):
@@ -198,4 +206,4 @@ def keep(
     session = work.session.commit(gaussians, torch.from_numpy(rows).to(gaussians.means.device))
     if work.images.device.type == "cpu":
         return session, None
-    return session, Resident(gaussians, work.hierarchy, work.previous_images if delta.is_empty else work.images)
+    return session, Resident(gaussians, work.hierarchy, work.previous_images if delta.is_light_at_most else work.images)

@@ -8,6 +8,7 @@ frame is compared with are multiplied by it, and what is left is what changed.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -52,16 +53,17 @@ def switched(assembly: Assembly, state: StreamState, frame: Frame) -> Light | No
     first, then = _looked_at(state.previous.images), _looked_at(frame.images)
     tells = (np.minimum(first, then) > DARKEST) & (np.maximum(first, then) < BRIGHTEST)
     count, least = tells.sum(2, keepdims=True), MOST_CAMERAS * len(first)
-    enough = (count >= FEWEST).all((1, 2))
-    if np.count_nonzero(enough) < least:
-        return None
-    first, then, tells, count = (each[enough] for each in (first, then, tells, count))
-    share = np.sort(np.where(tells, then, np.inf) / first.clip(1), 2)
+    share = np.sort(np.where(tells, then, 1e9) / first.clip(1), 2)
     share = np.take_along_axis(share, count // 2, 2)  # in the median of those that tell
     alike = tells & (np.abs(then - share * first) < ALIKE)
     brighter = (then * alike).sum(2) / (first * alike).sum(2).clip(1)
-    factor = np.median(brighter, 0).clip(1 / MOST_FACTOR, MOST_FACTOR)
-    changed = np.abs(np.log(factor)) >= np.log1p(LEAST)
+    enough = count[..., 0] >= FEWEST
+    told = enough.sum(0) >= least  # a room without blue light says nothing of blue
+    if not told.any():
+        return None
+    factor = np.array([np.median(brighter[enough[:, c], c]) if told[c] else np.nan for c in range(3)])
+    factor = np.where(told, factor, np.nanmedian(factor)).clip(1 / MOST_FACTOR, MOST_FACTOR)
+    changed = told & (np.abs(np.log(factor)) >= np.log1p(LEAST))
     if not changed.any():
         return None
     expected = np.minimum(first * factor[:, None], 255)
@@ -93,11 +95,11 @@ def in_light(state: StreamState, light: Light) -> StreamState:
     """Return the state as if the scene had always been in this light: what players have, and the pictures it shows."""
     shown = state.previous
     lit = state.lit or looked_at(shown.index, FrameImages(shown.images, torch.device("cpu")), state.gains)
-    previous = np.stack([scaled(torch.from_numpy(image), light).numpy() for image in shown.images])
     return replace(
         state,
         player=lit_player(state.player, light),
-        previous=replace(shown, images=previous),
+        previous=lit_frame(shown, light),
+        lamps=(*state.lamps, light),
         lit=lit.in_light(light.factor),
         session=None,
         resident=None,
@@ -113,6 +115,27 @@ def lit_player(player: PlayerState, light: Light) -> PlayerState:
     """Return what players have of a frame, in another light."""
     background = lit_background(player.meta.background, light)
     return replace(player, scene=apply_light(player.scene, light), meta=replace(player.meta, background=background))
+
+
+def lit_frame(frame: Frame, light: Light) -> Frame:
+    """Return a frame whose pictures, as they are stored, are in another light."""
+    return replace(frame, images=np.stack([scaled(torch.from_numpy(image), light).numpy() for image in frame.images]))
+
+
+def resumed_in_light(state: StreamState, players: Iterable[PlayerState]) -> StreamState:
+    """Return the state of a stream that is resumed, with ``previous`` in the light of its end.
+
+    Arguments:
+        players: their states since the last key packet.
+    """
+    lamps: tuple[Light, ...] = ()
+    for player in players:
+        if player.delta is not None:
+            lamps = (*lamps, *([player.delta.light] if player.delta.light else []))
+            lamps = lamps if player.delta.is_light_at_most else ()
+    for lamp in lamps:
+        state = replace(state, previous=lit_frame(state.previous, lamp))
+    return replace(state, lamps=lamps)
 
 
 def scaled(pixels: torch.Tensor, light: Light) -> torch.Tensor:

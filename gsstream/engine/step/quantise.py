@@ -104,7 +104,7 @@ def encode_frame(
     found = trim_to_size(delta, packet, curvature, layout=before.layout, encode=encoded, max_bytes=limit)
     # Where only a share is asked for, a packet is not trimmed to nothing: one that is mostly headers would lose all of
     # its change for a few bytes.
-    lost = found.delta.is_empty or found.delta.has_row_edit != delta.has_row_edit
+    lost = found.delta.is_light_at_most or found.delta.has_row_edit != delta.has_row_edit
     return whole if max_bytes is None and lost else found
 
 

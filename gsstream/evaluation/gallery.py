@@ -74,9 +74,9 @@ def _write_summary(out: Path, meta: StreamMeta, records: Sequence[FrameRecord]) 
 def lamp_line(lines: Sequence[Mapping[str, Any]]) -> str:
     """Return in which frames a lamp was switched, and its factors of red, green and blue; empty where none was."""
     found = [
-        f"frame {line['frame']} x {'/'.join(f'{value:.2f}' for value in line['light'])}"
+        f"frame {line['frame']} x {'/'.join(f'{value:.2f}' for value in line['lamp'])}"
         for line in lines
-        if "light" in line
+        if "lamp" in line
     ]
     more = f" and {len(found) - MOST_LAMPS} more" if len(found) > MOST_LAMPS else ""
     return f"everything became brighter or darker at once: {', '.join(found[:MOST_LAMPS])}{more}" if found else ""

@@ -13,9 +13,12 @@ from gsstream.core.frame import Frame
 from gsstream.core.log import FrameLog
 from gsstream.core.shapes import FloatArray
 from gsstream.core.storage import to_bytes
+from gsstream.encode import encoder_for, open_recording
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.lamp import in_light, switched, with_lamp
+from gsstream.metrics import psnr
+from gsstream.player.render import render
 from gsstream.testing.cases import rig
 from gsstream.testing.method_driver import _before, fit_fixture
 
@@ -98,7 +101,6 @@ NONE = {
     "half of the cameras": one_camera(room(), 1.5, 2),
     "three of five": one_camera(room(), 1.5, 3),
     "other pictures altogether": room(7),
-    "a cut to darkness": np.zeros_like(room()),
     "a cut to white": np.ones_like(room()),
     "things that move in a third": moved(0.3),
     "things that move in most": moved(0.8),
@@ -143,7 +145,50 @@ def test_a_flash_leaves_what_the_next_looks_compare_with_as_it_was() -> None:
     assert known.player.meta.background == (0.5, 0.25, 0.125)
 
 
+@pytest.mark.parametrize("dark", [0.0, 0.01, 0.1])
+def test_a_room_goes_dark_and_when_the_light_is_back_it_is_as_it_was(dark: float) -> None:
+    """Regression: what had gone dark was shown bright, because nothing changed any more, and bright again by pieces."""
+    world = "synthetic:frames=7&views=4&width=64&height=48&supersample=1&static=1"
+    settings = {"first_frame.max_iterations": 60, "first_frame.max_points": 600, "stream.epochs": 2}
+    told, quality, means = [], [], []
+    with open_recording(world) as source:
+        encoder = encoder_for("s2gs-edge", source, settings)
+        for index, light in enumerate((1.0, 1.0, dark, dark, 1.0, 1.0, 1.0)):
+            now = source.frame(index)
+            images = to_bytes(now.images * np.float32(light))
+            made = encoder.encode(replace(now, images=images))
+            told += [index] if "lamp" in made.metrics else []
+            player = made.state.player
+            shown = [
+                np.clip(render(player.gaussians, now.cameras, view, background=player.meta.background), 0, 1)
+                for view in range(4)
+            ]
+            means.append(255 * np.mean(shown))
+            truths = images.astype(np.float32) / 255
+            quality.append(np.mean([psnr(*pair) for pair in zip(shown, truths, strict=True)]))
+    assert told == [2, 4]
+    assert max(abs(value - dark * means[1]) for value in means[2:4]) < 1.0
+    assert min(quality[2:4]) > quality[1]
+    assert min(quality[4:]) > quality[1] - 0.2
+
+
 def test_a_factor_that_does_not_fit_is_not_looked_for() -> None:
     before, now = state(room()), frame(room() * np.float32(1.3))
     for most in (16, 26):
         assert with_lamp(parts(), before, now, most, FrameLog()).light is None
+
+
+def test_no_key_packet_is_made_in_the_dark() -> None:
+    """Its grid would leave little of the colours; where the light is back there is one, of the room as it was."""
+    world = "synthetic:frames=7&views=4&width=48&height=36&supersample=1&static=1"
+    settings = {"first_frame.max_iterations": 20, "first_frame.max_points": 300, "stream.epochs": 1}
+    with open_recording(world) as source:
+        encoder = encoder_for("s2gs-edge", source, {**settings, "codec.key_interval": 2})
+        made = []
+        for index, light in enumerate((1.0, 1.0, 0.02, 0.02, 0.02, 1.0, 1.0)):
+            now = source.frame(index)
+            made.append(encoder.encode(replace(now, images=to_bytes(now.images * np.float32(light)))))
+    assert [step.status == "key" for step in made] == [True, False, False, False, False, True, False]
+    assert [step.metrics.get("key_postponed") for step in made[2:5]] == ["period: the light is off"] * 3
+    first, last = (step.state.player.gaussians.sh0 for step in (made[0], made[-1]))
+    assert np.abs(np.sort(first, 0) - np.sort(last, 0)).mean() < 0.05

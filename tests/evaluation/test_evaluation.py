@@ -217,10 +217,10 @@ def test_a_camera_that_drifted_is_named_with_its_last_gain() -> None:
 
 
 def test_lamps_are_told_by_their_frames_and_not_without_end() -> None:
-    lines = [{"frame": 0}, {"frame": 1, "light": [1.25, 0.5, 1.0]}, {"frame": 2}]
+    lines = [{"frame": 0}, {"frame": 1, "lamp": [1.25, 0.5, 1.0]}, {"frame": 2}]
     assert lamp_line(lines) == "everything became brighter or darker at once: frame 1 x 1.25/0.50/1.00"
     assert lamp_line(lines[2:]) == ""
-    many = [{"frame": frame, "light": [1.5, 1.5, 1.5]} for frame in range(9)]
+    many = [{"frame": frame, "lamp": [1.5, 1.5, 1.5]} for frame in range(9)]
     assert lamp_line(many).endswith("frame 5 x 1.50/1.50/1.50 and 3 more")
 
 

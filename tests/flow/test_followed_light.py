@@ -55,7 +55,7 @@ def followed(out: Path) -> list[int]:
 
 def switched(out: Path) -> dict[int, list[float]]:
     """Frames in which a lamp was switched, and its factor."""
-    return {line["frame"]: line["light"] for line in metrics(out) if "light" in line}
+    return {line["frame"]: line["lamp"] for line in metrics(out) if "lamp" in line}
 
 
 def quality(out: Path, frames: slice) -> float:

@@ -64,7 +64,7 @@ def drifts(lines: Lines) -> bool:
 
 def lit_in(frame: int) -> Callable[[Lines], bool]:
     """Whether that frame alone says that a lamp was switched."""
-    return lambda lines: [line["frame"] for line in lines if "light" in line] == [frame]
+    return lambda lines: [line["frame"] for line in lines if "lamp" in line] == [frame]
 
 
 def stands_still(lines: Lines) -> bool:

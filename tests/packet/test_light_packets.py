@@ -17,7 +17,7 @@ from gsstream.core.errors import PacketError, ShapeError
 from gsstream.packet import PlayerState, decode_delta, encode_delta
 from gsstream.player.render import render
 
-FACTORS = st.lists(st.floats(1 / 16, 16), min_size=3, max_size=3)
+FACTORS = st.lists(st.floats(1 / 256, 256), min_size=3, max_size=3)
 
 
 def behind(state: PlayerState, *colour: float) -> PlayerState:
@@ -77,14 +77,14 @@ def test_motions_form_groups_by_what_the_light_leaves() -> None:
 
 def test_a_light_and_its_inverse_leave_next_to_nothing() -> None:
     state = begin(np.random.default_rng(5), 60, 9)
-    there = follow(state, Delta((Light((16.0, 0.0625, 2.0)),)))
-    back = follow(there, Delta((Light((0.0625, 16.0, 0.5)),)))
+    there = follow(state, Delta((Light((16.0, 0.00390625, 2.0)),)))
+    back = follow(there, Delta((Light((0.0625, 256.0, 0.5)),)))
     for name in ("sh0", "shN"):
         np.testing.assert_allclose(getattr(back.gaussians, name), getattr(state.gaussians, name), rtol=2e-6, atol=2e-6)
 
 
 @pytest.mark.parametrize(
-    "factor", [(0.06, 1, 1), (1, 16.1, 1), (1, 1, 0), (1, 1, -1), (1.1, 1, 1), (1, 1), (np.nan,) * 3]
+    "factor", [(0.0039, 1, 1), (1, 256.5, 1), (1, 1, 0), (1, 1, -1), (1.1, 1, 1), (1, 1), (np.nan,) * 3]
 )
 def test_what_cannot_be_sent_is_refused(factor: tuple[float, ...]) -> None:
     state = begin(np.random.default_rng(6), 10, 3)

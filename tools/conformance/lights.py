@@ -17,8 +17,8 @@ from tools.conformance.residuals import attribute, residual
 from tools.conformance.tapes import Tape, Vector, playing, refusing
 
 NAN, INFINITY = float("nan"), float("inf")
-#: The next of binary16 above 16 and below 1/16.
-ABOVE, BELOW = 16.015625, 0.06243896484375
+#: The next of binary16 above 256 and below 1/256.
+ABOVE, BELOW = 256.25, 0.0039043426513671875
 
 
 def vectors() -> Iterator[Vector]:
@@ -35,7 +35,7 @@ def light(*factor: float) -> bytes:
 def _sound() -> Iterator[Vector]:
     for degree, rest in enumerate((0, 3, 8, 15)):
         tape = Tape().start(500 + degree, 12, 5, rest)
-        for factor in ((1.2998046875, 1.2998046875, 1.2998046875), (1, 0.5, 2), (16, 0.0625, 0.7001953125)):
+        for factor in ((1.2998046875, 1.2998046875, 1.2998046875), (1, 0.5, 2), (256, 0.00390625, 0.7001953125)):
             tape.delta([("light", light(*factor))])
         yield playing(f"light-alone-degree-{degree}", "light harmonics", "4.10-1 4.10-2 4.2-2", tape.empty())
     tape = Tape().start(510, 14, 6, 3)

@@ -11,8 +11,8 @@ from gsstream.core.errors import ShapeError
 from gsstream.core.gaussians import SH0
 from gsstream.core.shapes import FloatArray
 
-#: A factor lies between the inverse of this and this.
-MOST_FACTOR = 16.0
+#: A factor lies between the inverse of this and this: what is white leaves a level of 255 in the dark.
+MOST_FACTOR = 256.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +20,7 @@ class Light:
     """Every colour, and the background, becomes ``factor`` times as bright.
 
     Arguments:
-        factor: red, green, blue, each 1/16 to 16 and a value of binary16, as which it is sent
+        factor: red, green, blue, each 1/256 to 256 and a value of binary16, as which it is sent
             (:func:`sendable_factor`).
     """
 

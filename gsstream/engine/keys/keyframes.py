@@ -27,19 +27,27 @@ from gsstream.packet import PlayerState, StreamMeta, quantise_key
 
 #: Why a frame became a key packet: the refined first frame is ready.
 REFINED = "refined"
+#: Share of the light of before below which no key packet is made: its grid would leave little of the colours, and the
+#: encoder would forget what the room looks like in the light.
+DARK = 1 / 8
 
 
 def key_packet_if_due(assembly: Assembly, step: Step, frame: Frame, tools: Tools, before: PlayerState) -> Step:
     """Return ``step``, or when a key packet is due at this frame, the step that writes one instead.
 
-    A key packet that the budget refuses, or whose frame is skipped, stays due: the next frame tries again. ``before``:
-    what players have after the frame before.
+    A key packet that the budget refuses, whose frame is skipped or that falls into the dark stays due: the next frame
+    tries again. ``before``: what players have after the frame before.
     """
     reason, state = _due(assembly, step), step.state
     if reason is None:
         return step
     # A skipped frame stays an empty packet: it must not fail, and a key packet would take the time that skipping saves.
-    refused = "the frame is skipped" if frame.epoch_scale == 0 else tools.key_refusal(len(state.gaussians))
+    if frame.epoch_scale == 0:
+        refused: str | None = "the frame is skipped"
+    elif state.lit is not None and min(state.lit.lamps) < DARK:
+        refused = "the light is off"
+    else:
+        refused = tools.key_refusal(len(state.gaussians))
     if refused is not None:
         return _postponed(step, reason, refused, tools)
     if state.lamps:  # a key packet does not say in whose light an older picture is

@@ -16,13 +16,12 @@ import numpy as np
 import torch
 
 from gsstream.core.changes import Light, apply_light, lit_background, sendable_factor
-from gsstream.core.changes.light import MOST_FACTOR
 from gsstream.core.frame import Frame
 from gsstream.core.log import FrameLog
-from gsstream.core.shapes import FloatArray
+from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.photometric import FrameImages
-from gsstream.engine.state.drift import looked_at
+from gsstream.engine.state.drift import Lit, looked_at
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.packet import PlayerState
 
@@ -33,6 +32,8 @@ PIXELS = 1024
 DARKEST, BRIGHTEST = 12.0, 250.0
 #: Least share by which a channel must have become brighter or darker: slower changes are followed by the colours.
 LEAST = 0.02
+#: The same in the dark, mean levels of 255 of what the room looked like in the light.
+LEAST_LEVELS = 2.0
 #: Share of a camera's difference, in the median, that may be left when the factor is taken out; share of the cameras
 #: for which this must hold; and least number of pixels that a camera must have.
 MOST_LEFT, MOST_CAMERAS, FEWEST = 0.5, 0.75, 24
@@ -50,25 +51,62 @@ def switched(assembly: Assembly, state: StreamState, frame: Frame) -> Light | No
     """
     if assembly.recipe.stream.light == 0 or len(frame.images) < 2:
         return None
-    first, then = _looked_at(state.previous.images), _looked_at(frame.images)
+    first, then = _levels(state.previous.images), _levels(frame.images)
     tells = (np.minimum(first, then) > DARKEST) & (np.maximum(first, then) < BRIGHTEST)
-    count, least = tells.sum(2, keepdims=True), MOST_CAMERAS * len(first)
+    found = _brighter(first, then, tells)
+    if found is None:
+        return _after_dark(state, frame)
+    factor, told = found
+    changed = told & (np.abs(np.log(factor)) >= np.log1p(LEAST))
+    return _light(factor, changed, then, before=first, expected=first * factor[:, None])
+
+
+def _after_dark(state: StreamState, frame: Frame) -> Light | None:
+    """The factor of a lamp that leaves no light, or that is switched on in the dark; None without one.
+
+    The last picture, or this one, says nothing of it. What the room looked like in the light does: the frame whose
+    light the colours have, and the lamps that were switched since.
+    """
+    lit, now = _lit(state), looked_at(frame.index, FrameImages(frame.images, torch.device("cpu")), None)
+    before, then = (_levels(each.pixels[0].cpu().numpy()) for each in (lit, now))
+    found = _brighter(before, then, (before > 2 * DARKEST) & (np.maximum(before, then) < BRIGHTEST))
+    if found is None:
+        return None
+    brighter, told = found
+    lamps = np.array(lit.lamps)
+    changed = told & (np.abs(brighter - lamps) * before.mean((0, 2)) > LEAST_LEVELS)
+    had = before * lamps[:, None]
+    return _light(brighter / lamps, changed, then, before=had, expected=before * brighter[:, None])
+
+
+def _brighter(first: FloatArray, then: FloatArray, tells: BoolArray) -> tuple[FloatArray, BoolArray] | None:
+    """[3] by how much most pixels that tell became brighter, in the median of the cameras, and which channels tell.
+
+    A channel that does not takes the factor of the others: a room without blue light says nothing of blue. None: none
+    tells.
+    """
+    count = tells.sum(2, keepdims=True)
     share = np.sort(np.where(tells, then, 1e9) / first.clip(1), 2)
     share = np.take_along_axis(share, count // 2, 2)  # in the median of those that tell
     alike = tells & (np.abs(then - share * first) < ALIKE)
-    brighter = (then * alike).sum(2) / (first * alike).sum(2).clip(1)
+    ratio = (then * alike).sum(2) / (first * alike).sum(2).clip(1)
     enough = count[..., 0] >= FEWEST
-    told = enough.sum(0) >= least  # a room without blue light says nothing of blue
+    told = enough.sum(0) >= MOST_CAMERAS * len(first)
     if not told.any():
         return None
-    factor = np.array([np.median(brighter[enough[:, c], c]) if told[c] else np.nan for c in range(3)])
-    factor = np.where(told, factor, np.nanmedian(factor)).clip(1 / MOST_FACTOR, MOST_FACTOR)
-    changed = told & (np.abs(np.log(factor)) >= np.log1p(LEAST))
+    factor = np.array([np.median(ratio[enough[:, c], c]) if told[c] else np.nan for c in range(3)])
+    return np.where(told, factor, np.nanmedian(factor)), told
+
+
+def _light(
+    factor: FloatArray, changed: BoolArray, then: FloatArray, *, before: FloatArray, expected: FloatArray
+) -> Light | None:
+    """The factor, where it leaves little of what changed in most cameras; ``changed``: channels it is about."""
     if not changed.any():
         return None
-    expected = np.minimum(first * factor[:, None], 255)
-    left, whole = (np.median(np.abs(then - other)[:, changed], (1, 2)) for other in (expected, first))
-    return Light(sendable_factor(factor)) if np.count_nonzero(left <= MOST_LEFT * whole) >= least else None
+    left, whole = (np.median(np.abs(then - each.clip(0, 255))[:, changed], (1, 2)) for each in (expected, before))
+    explained = np.count_nonzero(left <= MOST_LEFT * whole)
+    return Light(sendable_factor(factor)) if explained >= MOST_CAMERAS * len(then) else None
 
 
 class Lamp(NamedTuple):
@@ -86,24 +124,28 @@ def with_lamp(assembly: Assembly, state: StreamState, frame: Frame, max_bytes: i
     light = switched(assembly, state, frame)
     if light is None:
         return Lamp(assembly, state, None)
-    log.set(light=list(light.factor))
+    log.set(lamp=list(light.factor))
     state = in_light(state, light)
     return Lamp(in_light_of(assembly, state.player), state, light)
 
 
 def in_light(state: StreamState, light: Light) -> StreamState:
     """Return the state as if the scene had always been in this light: what players have, and the pictures it shows."""
-    shown = state.previous
-    lit = state.lit or looked_at(shown.index, FrameImages(shown.images, torch.device("cpu")), state.gains)
     return replace(
         state,
         player=lit_player(state.player, light),
-        previous=lit_frame(shown, light),
+        previous=lit_frame(state.previous, light),
         lamps=(*state.lamps, light),
-        lit=lit.in_light(light.factor),
+        lit=_lit(state).in_light(light.factor),
         session=None,
         resident=None,
     )
+
+
+def _lit(state: StreamState) -> Lit:
+    """The frame whose light the colours have; without one, that which the scene shows."""
+    shown = state.previous
+    return state.lit or looked_at(shown.index, FrameImages(shown.images, torch.device("cpu")), state.gains)
 
 
 def in_light_of(assembly: Assembly, player: PlayerState) -> Assembly:
@@ -146,8 +188,8 @@ def scaled(pixels: torch.Tensor, light: Light) -> torch.Tensor:
     return brighter.clamp(0, 1)
 
 
-def _looked_at(images: FloatArray) -> FloatArray:
-    """Pixels [V, 3, P] of images [V, H, W, 3] as they are stored, levels of 255."""
+def _levels(images: FloatArray) -> FloatArray:
+    """Some pixels [V, 3, P] of images [V, H, W, 3] as they are stored, levels of 255."""
     count, height, width = images.shape[:3]
     step = max(math.isqrt(height * width // PIXELS), 1)
     some = images[:, step // 2 :: step, step // 2 :: step].reshape(count, -1, 3)

@@ -4,7 +4,7 @@ import { PacketError } from "../errors.js";
 import { later } from "../key.js";
 import { half } from "./residual.js";
 
-const [LEAST, MOST] = [1 / 16, 16];
+const [LEAST, MOST] = [1 / 256, 256];
 /** Half, which a colour has where sh0 is 0, over the harmonic of degree 0. */
 const OFFSET = 1.7724538509055159;
 

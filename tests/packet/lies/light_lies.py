@@ -25,7 +25,7 @@ def light_victim() -> Victim:
 def _lies() -> Lies:
     for size in (0, 1, 5, 7, 600):
         yield f"{size} bytes", "light", bytes(size), f"light: expected 6 bytes, got {size}"
-    for wrong in (0.0, -0.0, -1.0, 0.0624, 16.01, 65504.0, float("nan"), float("inf"), -float("inf")):
+    for wrong in (0.0, -0.0, -1.0, 0.0039, 257.0, 65504.0, float("nan"), float("inf"), -float("inf")):
         for channel in range(3):
             factor = [1.0, 1.0, 1.0]
             factor[channel] = wrong

@@ -26,7 +26,7 @@ int gss_apply_light(gss_stream *s, span section, state *next)
     NEED(s, section.size == 6, "R-1.3-6");
     for (int c = 0; c < 3; c++) {
         factor[c] = gss_half(section.at + 2 * c);
-        NEED(s, factor[c] >= 0.0625f && factor[c] <= 16.0f, "R-4.10-1");
+        NEED(s, factor[c] >= 0.00390625f && factor[c] <= 256.0f, "R-4.10-1");
         offset[c] = (float)(((double)factor[c] - 1) * 1.7724538509055159);
         scene->background[c] *= factor[c];
         NEED(s, isfinite(scene->background[c]), "R-4.10-2");

@@ -89,7 +89,7 @@ def test_a_camera_that_sees_nothing_changes_nothing_for_the_others() -> None:
     cameras = replace(frame.cameras, viewmats=away)
     cameras.validate()
     blind = replace(state, previous=replace(state.previous, cameras=cameras), session=None)
-    step = subject.step(blind, replace(shown(frame, 1, lambda images: images * 0.7), cameras=cameras))
+    step = subject.step(blind, replace(shown(frame, 1, FLASHES["upside down"]), cameras=cameras))
     assert_sound(step.state)
     assert step.metrics["iterations"] > 0
 
@@ -176,8 +176,8 @@ def test_an_alternating_flash_is_followed_both_ways() -> None:
         step = subject.step(state, now)
         state = step.state
         assert_sound(state)
-        changed.append(step.metrics["changed_tiles"])
-    assert min(changed) > 0
+        changed.append(step.metrics["changed_tiles"] > 0 or "lamp" in step.metrics)
+    assert all(changed)
     assert quality(subject, state, frame) > 10
 
 
@@ -193,7 +193,7 @@ def test_a_spike_of_the_learning_rate_is_refused_or_survived_never_sent_as_garba
         self.code.lrs.mul_(lr)
 
     monkeypatch.setattr(_Fit, "__init__", spiked)
-    now = shown(frame, 1, lambda images: images * 0.6)
+    now = shown(frame, 1, FLASHES["upside down"])
     if lr == 1e3:
         assert_sound(subject.step(state, now).state)
         return

@@ -86,11 +86,11 @@ def make_rows(rng: np.random.Generator, scene: Scene, sh_rest: int) -> RowEdit:
     return RowEdit(added if rng.random() < 0.8 or not len(gone) else None, gone)
 
 
-def make_delta(rng: np.random.Generator, scene: Scene, sh_rest: int) -> Delta:
+def make_delta(rng: np.random.Generator, scene: Scene, sh_rest: int, lights: bool) -> Delta:
     """Perhaps a light, zero to three motions, perhaps a residual, perhaps rows; at least one but the light."""
     changes: list[Light | Motion | Residual | RowEdit] = []
     after = scene
-    if rng.random() < 0.4:
+    if lights and rng.random() < 0.4:
         changes.append(Light(sendable_factor(np.exp(0.5 * rng.normal(size=3)))))
         after = apply_light(scene, changes[0])
     for _ in range(int(rng.integers(0, 4))):
@@ -106,9 +106,19 @@ def make_delta(rng: np.random.Generator, scene: Scene, sh_rest: int) -> Delta:
 
 
 def moving_packets(
-    seed: int, frames: int = 12, number: int = 300, nodes: int = 40, sh_rest: int = 3, key_at: int = 7
+    seed: int,
+    frames: int = 12,
+    number: int = 300,
+    nodes: int = 40,
+    sh_rest: int = 3,
+    key_at: int = 7,
+    *,
+    lights: bool = True,
 ) -> list[EncodedPacket]:
-    """A stream whose deltas hold every order and number of changes; the packet of frame 4 is empty."""
+    """A stream whose deltas hold every order and number of changes; the packet of frame 4 is empty.
+
+    Without ``lights`` colours stay between those that another engine's splats can hold.
+    """
     rng = np.random.default_rng(seed)
     state: PlayerState | None = None
     packets = []
@@ -120,7 +130,7 @@ def moving_packets(
         elif frame == 4:
             packet = encode_empty(frame=frame)
         else:
-            delta = make_delta(rng, state.scene, sh_rest)
+            delta = make_delta(rng, state.scene, sh_rest, lights)
             packet = encode_delta(delta, state.layout, state.decoders, frame=frame)
         packets.append(packet)
         state = decode_packet(state, packet.data)

@@ -76,7 +76,7 @@ def test_the_focus_is_seen_and_shows_the_bar(site, tmp_path):
     """The bar of a playing stream goes when nothing moves, and comes with the focus."""
     steps = [
         ["go", "URL/index.html?autoplay=1"], READY, ["until", f"{BAR} === 0", 20], ["evaluate", BAR],
-        *press("Tab"), ["pause", 500], ["evaluate", f"[{FOCUS}, {BAR}]"], ["pause", 4000],
+        *press("Tab"), ["until", f"{BAR} > 0.9", 20], ["evaluate", f"[{FOCUS}, {BAR}]"], ["pause", 4000],
         *press("Tab"), ["pause", 4000], ["evaluate", f"[{FOCUS}, {BAR}]"],
         ["evaluate", f"getComputedStyle({ROOT}.activeElement).outlineStyle"],
     ]  # fmt: skip

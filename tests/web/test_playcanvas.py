@@ -79,7 +79,7 @@ CASES = [(0, 0.0, 20), (15, 0.0, 20), (0, -1.5, 38), (15, -1.5, 38)]
 def packets_of(rest: int, size: float) -> list[EncodedPacket]:
     """Six frames in which everything changes, twice from a key packet; or one frame of Gaussians of another size."""
     if size == 0:
-        return moving_packets(seed=9, frames=6, number=300, sh_rest=rest, key_at=5)
+        return moving_packets(seed=9, frames=6, number=300, sh_rest=rest, key_at=5, lights=False)
     gaussians = make_gaussians(np.random.default_rng(9), 300, rest)
     smaller = dataclasses.replace(gaussians, scales=gaussians.scales + np.float32(size))
     layout = Layout(np.int32([300]), np.zeros(300, np.uint8), np.float32([1.0]))

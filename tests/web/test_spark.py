@@ -48,7 +48,7 @@ PICTURE = """(async () => {{
 def test_pictures_and_uploads(tmp_path):
     stream = tmp_path / "s.gss"
     with StreamWriter.open(stream) as writer:
-        for packet in moving_packets(seed=9, frames=6, number=300, sh_rest=3, key_at=99):
+        for packet in moving_packets(seed=9, frames=6, number=300, sh_rest=3, key_at=99, lights=False):
             writer.append(packet)
     package(stream, tmp_path / "page" / "site")
     for name in ("index.html", "gsstream-spark.js"):

@@ -100,8 +100,17 @@ def test_a_module_that_does_not_come_is_done_without_or_told(site, tmp_path, req
         assert len(workers) > 15
         assert {name for name in workers if not found[name][0]} == set()
     else:
-        # Workers are done without; everything else is needed.
-        assert {name for name, (plays, _) in found.items() if plays} == {"sort-worker.js", "stream-worker.js"}
+        # Workers are done without, and what decodes a light until there is one; everything else is needed.
+        without = {"sort-worker.js", "stream-worker.js", "light.js"}
+        assert {name for name, (plays, _) in found.items() if plays} == without
+
+
+def test_a_stream_whose_next_packet_needs_a_module_that_does_not_come_says_so(site, tmp_path):
+    steps = [["go", "URL/index.html"], READY, ["evaluate", f"void {PLAYER}.seek(11)"]]
+    steps += [["until", f"{MESSAGE}.length > 9", 20], ["evaluate", MESSAGE]]
+    with serving(site, lost=["light.js", 99]) as (url, _):
+        *_, told = in_browser(at(url, steps), tmp_path)
+    assert "light.js" in told
 
 
 def test_a_part_that_only_some_ask_for_is_told_where_it_does_not_come(site, tmp_path):

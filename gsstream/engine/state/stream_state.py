@@ -71,8 +71,6 @@ class StreamState:
     #: Training images of the last frame whose packet changed the scene: what the scene shows. As bytes
     #: where bytes hold them.
     previous: Frame
-    #: Lamps that were switched since, in whose light ``previous`` is.
-    lamps: tuple[Light, ...] = ()
     #: Linear decoders to continue from; equal to the player's once they were sent.
     decoders: Mapping[str, torch.Tensor] = field(default_factory=dict)
     exposure: Exposure | None = None  # colour maps of the training cameras, or None
@@ -85,6 +83,8 @@ class StreamState:
     refinement: Refinement | None = None
     #: State of the motion part after the packets since the last key packet (``MotionPart.follow``).
     motion_memory: Any = None
+    #: Lamps that were switched since ``previous``, in whose light it is.
+    lamps: tuple[Light, ...] = ()
     #: The frame whose light the colours of what stands still have; None before the first that was looked at.
     lit: Lit | None = field(default=None, compare=False, repr=False)
     #: What the renderer keeps of this scene from one frame to the next. Nothing but time depends on it: a state

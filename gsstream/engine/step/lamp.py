@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from gsstream.core.changes import Light, apply_light, lit_background, sendable_f
 from gsstream.core.frame import Frame
 from gsstream.core.log import FrameLog
 from gsstream.core.shapes import BoolArray, FloatArray
+from gsstream.core.storage import to_bytes, unpacked
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.photometric import FrameImages
 from gsstream.engine.state.drift import Lit, looked_at
@@ -126,7 +128,7 @@ def with_lamp(assembly: Assembly, state: StreamState, frame: Frame, max_bytes: i
         return Lamp(assembly, state, None)
     log.set(lamp=list(light.factor))
     state = in_light(state, light)
-    return Lamp(in_light_of(assembly, state.player), state, light)
+    return Lamp(replace(assembly, background=state.player.meta.background), state, light)
 
 
 def in_light(state: StreamState, light: Light) -> StreamState:
@@ -148,11 +150,6 @@ def _lit(state: StreamState) -> Lit:
     return state.lit or looked_at(shown.index, FrameImages(shown.images, torch.device("cpu")), state.gains)
 
 
-def in_light_of(assembly: Assembly, player: PlayerState) -> Assembly:
-    """Return the parts of a run before the background that players have."""
-    return replace(assembly, background=player.meta.background)
-
-
 def lit_player(player: PlayerState, light: Light) -> PlayerState:
     """Return what players have of a frame, in another light."""
     background = lit_background(player.meta.background, light)
@@ -161,7 +158,10 @@ def lit_player(player: PlayerState, light: Light) -> PlayerState:
 
 def lit_frame(frame: Frame, light: Light) -> Frame:
     """Return a frame whose pictures, as they are stored, are in another light."""
-    return replace(frame, images=np.stack([scaled(torch.from_numpy(image), light).numpy() for image in frame.images]))
+    stored = to_bytes if frame.images.dtype == np.uint8 else partial(np.clip, a_min=0, a_max=1)
+    factor = np.asarray(light.factor, np.float32)
+    # View by view: as float32 all of them would take four times their memory.
+    return replace(frame, images=np.stack([stored(unpacked(image) * factor) for image in frame.images]))
 
 
 def resumed_in_light(state: StreamState, players: Iterable[PlayerState]) -> StreamState:
@@ -171,21 +171,14 @@ def resumed_in_light(state: StreamState, players: Iterable[PlayerState]) -> Stre
         players: their states since the last key packet.
     """
     lamps: tuple[Light, ...] = ()
-    for player in players:
-        if player.delta is not None:
-            lamps = (*lamps, *([player.delta.light] if player.delta.light else []))
-            lamps = lamps if player.delta.is_light_at_most else ()
+    for delta in (player.delta for player in players if player.delta is not None):
+        if not delta.is_light_at_most:
+            lamps = ()
+        elif delta.light is not None:
+            lamps = (*lamps, delta.light)
     for lamp in lamps:
         state = replace(state, previous=lit_frame(state.previous, lamp))
     return replace(state, lamps=lamps)
-
-
-def scaled(pixels: torch.Tensor, light: Light) -> torch.Tensor:
-    """Return pixels [..., 3] in another light, of the type in which they are stored."""
-    brighter = pixels.float() * pixels.new_tensor(light.factor, dtype=torch.float32)
-    if pixels.dtype == torch.uint8:
-        return brighter.round().clamp(0, 255).to(torch.uint8)
-    return brighter.clamp(0, 1)
 
 
 def _levels(images: FloatArray) -> FloatArray:

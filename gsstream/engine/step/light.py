@@ -30,7 +30,7 @@ from gsstream.engine.state.drift import EVERY, Lit, drift, looked_at
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.context import EngineContext
 from gsstream.engine.step.gains import camera_offsets, drawn_by_row, new_gains
-from gsstream.engine.step.lamp import in_light_of, lit_player
+from gsstream.engine.step.lamp import lit_player
 from gsstream.engine.step.light_symbols import with_light
 from gsstream.method.packets import delta_packet
 from gsstream.method.tools import Tools
@@ -103,8 +103,9 @@ def looked_after(assembly: Assembly, state: StreamState, players: Iterable[Playe
         if player.frame % EVERY == 0:
             frame = tools.recorded(player.frame).as_stored()
             if frame.epoch_scale:  # a frame that was skipped was not looked at
-                images, parts = FrameImages(frame.images, assembly.renderer.device), in_light_of(assembly, before)
-                found, _ = look(parts, replace(found, player=before), frame, images, FrameLog())
+                images = FrameImages(frame.images, assembly.renderer.device)
+                there = replace(assembly, background=before.meta.background)
+                found, _ = look(there, replace(found, player=before), frame, images, FrameLog())
                 if _decoder_rows(player) > len(state.decoders["sh0"]):
                     found = replace(found, lit=looked_at(player.frame, images, found.gains))
         before = player

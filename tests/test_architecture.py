@@ -176,3 +176,16 @@ def test_the_lists_of_conftest_name_files_that_exist() -> None:
     found = {path.with_suffix("").as_posix() for path in (ROOT / "tests").rglob("test_*.py")}
     found |= {path.with_suffix("").as_posix() for path in (ROOT / "plugins").glob("*/tests/test_*.py")}
     assert [name for name in names if not any(path.endswith(f"/{name}") for path in found)] == []
+
+
+def test_no_two_files_of_the_tests_have_the_same_name() -> None:
+    """Python finds these modules by their bare names: pytest refuses a second one, or takes its helpers."""
+    folders = [ROOT / "tests", *sorted((ROOT / "plugins").glob("*/tests"))]
+    paths = [path for folder in folders for path in folder.rglob("*.py") if not (path.parent / "__init__.py").exists()]
+    assert len(paths) > 300
+    found: dict[str, list[str]] = {}
+    for path in paths:
+        if path.name != "conftest.py":
+            found.setdefault(path.name, []).append(path.relative_to(ROOT).as_posix())
+    assert {name: where for name, where in found.items() if len(where) > 1} == {}
+    assert {name.removesuffix(".py") for name in found} & sys.stdlib_module_names == set()

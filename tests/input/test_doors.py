@@ -26,7 +26,7 @@ from gsstream.input.prepare.raw import find_cameras
 from gsstream.input.prepare.validate import validate
 from gsstream.input.recordings.base import Source
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
-from tests.input.recordings.scenes import write_video
+from tests.input.recordings.tiny_recordings import write_video
 
 FRAMES = 12
 IDS = ("cam00", "cam01", "cam02", "cam03")

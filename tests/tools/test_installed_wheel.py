@@ -13,17 +13,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.input.recordings import scenes
+from tests.input.recordings import tiny_recordings
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "howto" / "your-data.md"
 #: What stands in the first column of a row -> who writes such a folder. The demo stands for ``cameras.json``.
 WRITERS: dict[str, Callable[..., Path]] = {
-    "N3DV": lambda folder, world: scenes.write_n3dv(folder, world, style="folders"),
-    "ENeRF": scenes.write_enerf,
+    "N3DV": lambda folder, world: tiny_recordings.write_n3dv(folder, world, style="folders"),
+    "ENeRF": tiny_recordings.write_enerf,
     "PanopticSports": lambda folder, world: panoptic(folder, world),
-    "COLMAP": lambda folder, world: scenes.write_colmap(folder, world, binary=False, frames="folders"),
-    "nerfstudio": scenes.write_nerfstudio,
+    "COLMAP": lambda folder, world: tiny_recordings.write_colmap(folder, world, binary=False, frames="folders"),
+    "nerfstudio": tiny_recordings.write_nerfstudio,
 }
 #: The smallest run, and points of frame 0 without pycolmap, as the page says.
 SMALL = ["--frames", "1", "--set", "first_frame.max_iterations=2", "--set", "first_frame.points=auto", "--no-pictures"]
@@ -42,9 +42,9 @@ print(json.dumps(found))
 """
 
 
-def panoptic(folder: Path, world: scenes.World) -> Path:
+def panoptic(folder: Path, world: tiny_recordings.World) -> Path:
     """Write a recording whose cameras have some of the numbers of the data set."""
-    file = scenes.write_panoptic(folder, world) / "train_meta.json"
+    file = tiny_recordings.write_panoptic(folder, world) / "train_meta.json"
     numbers = {1: 10, 2: 15, 3: 30}
     meta = json.loads(file.read_text(encoding="utf-8"))
     meta["cam_id"] = [[numbers.get(number, number) for number in row] for row in meta["cam_id"]]
@@ -74,7 +74,7 @@ def commands_of_the_page() -> dict[str, list[str]]:
 
 @pytest.mark.slow
 def test_the_commands_of_the_page_run(installed: Path, tmp_path: Path) -> None:
-    world, calls = scenes.make_world(views=5, frames=2), []
+    world, calls = tiny_recordings.make_world(views=5, frames=2), []
     for what, command in commands_of_the_page().items():
         name = next((name for name in WRITERS if name in what), None)
         if name is not None:

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from tests.input.recordings import scenes
-from tests.input.recordings.scenes import World, write_frames, write_video
+from tests.input.recordings import tiny_recordings
 from tests.input.recordings.test_rigs import FORMATS, HEIGHT, NAMES, WIDTH
+from tests.input.recordings.tiny_recordings import World, write_frames, write_video
 
 FRAMES, RATE = 12, 25
 Edit = Callable[[Path], None]
@@ -52,7 +52,7 @@ class Reader:
 
 @cache
 def world() -> World:
-    return scenes.make_world(frames=FRAMES)
+    return tiny_recordings.make_world(frames=FRAMES)
 
 
 def in_json(name: str, change: Callable[[Any], Any]) -> Edit:
@@ -108,8 +108,8 @@ def declared(films: bool) -> Reader:
                 {
                     "id": name,
                     "split": "test" if c == 0 else "train",
-                    "width": scenes.SIZE[0],
-                    "height": scenes.SIZE[1],
+                    "width": tiny_recordings.SIZE[0],
+                    "height": tiny_recordings.SIZE[1],
                     "K": shown.Ks[c].tolist(),
                     "w2c": shown.poses[c].tolist(),
                     "frames": f"{name}.mkv" if films else f"{name}/%06d.png",
@@ -179,9 +179,9 @@ def llff(scheme: str, style: str, at: str) -> Reader:
     def write(folder: Path) -> None:
         shutil.rmtree(folder)
         if scheme == "meetroom":
-            scenes.write_meetroom(folder, world())
+            tiny_recordings.write_meetroom(folder, world())
         else:
-            scenes.write_n3dv(folder, world(), style=style)
+            tiny_recordings.write_n3dv(folder, world(), style=style)
         for path in folder.glob("*.mp4"):
             write_video(path, world().pictures[:, int(path.stem.lstrip("cam_"))], rate=RATE)
 
@@ -204,8 +204,8 @@ def easymocap(films: bool) -> Reader:
     names = tuple(f"{c:02d}" for c in range(4))
 
     def write(folder: Path) -> None:
-        scenes.write_enerf(folder, world())
-        width, height = scenes.SIZE
+        tiny_recordings.write_enerf(folder, world())
+        width, height = tiny_recordings.SIZE
         sizes = "".join(f"W_{name}: {width}\nH_{name}: {height}\n" for name in names)
         (folder / "intri.yml").write_text((folder / "intri.yml").read_text() + sizes)
         if films:
@@ -268,7 +268,7 @@ def panoptic() -> Reader:
     }
     at = "ims/{c}/{t:06d}.png"
     return Reader(
-        lambda folder: scenes.write_panoptic(folder, world()) and None,
+        lambda folder: tiny_recordings.write_panoptic(folder, world()) and None,
         "panoptic",
         ("0", "1", "2", "3"),
         at,
@@ -283,7 +283,7 @@ def panoptic() -> Reader:
 
 def colmap(films: bool) -> Reader:
     def write(folder: Path) -> None:
-        scenes.write_colmap(folder, world(), binary=False, frames="videos" if films else "folders")
+        tiny_recordings.write_colmap(folder, world(), binary=False, frames="videos" if films else "folders")
         for path in folder.glob("videos/*.mp4"):
             write_video(path, world().pictures[:, int(path.stem[3:])], rate=RATE)
 
@@ -316,7 +316,7 @@ def nerfstudio(style: str) -> Reader:
 
     def write(folder: Path) -> None:
         shutil.rmtree(folder)
-        scenes.write_nerfstudio(folder, world(), style="timed" if style == "splits" else style)
+        tiny_recordings.write_nerfstudio(folder, world(), style="timed" if style == "splits" else style)
         for path in folder.glob("*.mp4"):
             write_video(path, world().pictures[:, int(path.stem[3:])], rate=RATE)
         if style == "splits":

@@ -30,7 +30,7 @@ from gsstream.input.recordings.open import open_source, read_layout
 from gsstream.input.recordings.recorded import Recording
 from gsstream.input.recordings.sync import RecordingWarning
 from tests.input.faults.readers import FISHEYE, FRAMES, RATE, READERS, Edit, Reader
-from tests.input.recordings.scenes import write_png, write_video
+from tests.input.recordings.tiny_recordings import write_png, write_video
 
 CELLS = Path(__file__).parent / "cells.json"
 #: Sound recordings, until the process ends.

@@ -24,7 +24,7 @@ from gsstream.input.prepare.raw import find_cameras
 from gsstream.input.recordings.lens import from_colmap, undistortion
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source
 from tests.input.prepare.bad_scenes import save
-from tests.input.recordings.scenes import write_video
+from tests.input.recordings.tiny_recordings import write_video
 
 MAIN = "from gsstream.cli.main import main; main()"
 needs_pycolmap = pytest.mark.skipif(importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed")

@@ -25,7 +25,7 @@ from gsstream.input.recordings.options import DataOptions
 from gsstream.input.recordings.sync import RecordingWarning
 from gsstream.input.recordings.transformed import transformed
 from gsstream.input.recordings.video import VideoClip
-from tests.input.recordings.scenes import write_video
+from tests.input.recordings.tiny_recordings import write_video
 from tests.input.test_doors import bomb, chunk
 
 WORLD = "synthetic:frames=12&views=4&width=16&height=12&supersample=1&motion=3"

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import LAYOUTS, make_world, write_colmap
 from test_rigs import FORMATS, declared, pictures
+from tiny_recordings import LAYOUTS, make_world, write_colmap
 
 from gsstream.core.errors import SourceError
 from gsstream.input.recordings.base import SourceInfo

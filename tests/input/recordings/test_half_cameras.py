@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import LAYOUTS, SIZE, World, make_world, write_enerf
 from test_rigs import FORMATS, NAMES, pictures
+from tiny_recordings import LAYOUTS, SIZE, World, make_world, write_enerf
 
 from gsstream.core.errors import SourceError
 from gsstream.input.recordings.open import DEMO_FOLDER, open_source, read_layout

@@ -11,7 +11,17 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from scenes import LAYOUTS, SIZE, World, make_world, write_colmap, write_frames, write_n3dv, write_ply, write_png
+from tiny_recordings import (
+    LAYOUTS,
+    SIZE,
+    World,
+    make_world,
+    write_colmap,
+    write_frames,
+    write_n3dv,
+    write_ply,
+    write_png,
+)
 
 from gsstream.core.errors import SourceError
 from gsstream.discovery.catalog import load_catalog

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import LAYOUTS, World, make_world, tracks, world_points, write_colmap, write_n3dv, write_ply
+from tiny_recordings import LAYOUTS, World, make_world, tracks, world_points, write_colmap, write_n3dv, write_ply
 
 from gsstream.cli.main import run_command
 from gsstream.core.cameras import Cameras

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from scenes import World, make_world, write_nerfstudio
+from tiny_recordings import World, make_world, write_nerfstudio
 
 from gsstream.core.errors import SourceError
 from gsstream.input.recordings.open import open_source

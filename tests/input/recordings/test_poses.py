@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import SIZE, make_world, quaternion, write_colmap, write_enerf
+from tiny_recordings import SIZE, make_world, quaternion, write_colmap, write_enerf
 
 from gsstream.core.errors import SourceError
 from gsstream.input.recordings.lens import Lens, from_colmap, undistortion

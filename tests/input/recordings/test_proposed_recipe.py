@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from scenes import LAYOUTS, make_world, write_nerfstudio, write_panoptic
+from tiny_recordings import LAYOUTS, make_world, write_nerfstudio, write_panoptic
 
 from gsstream.cli.main import run_command
 from gsstream.cli.run import meant_for

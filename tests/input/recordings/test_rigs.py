@@ -18,7 +18,7 @@ from gsstream.input.recordings.open import open_source, read_layout
 from gsstream.input.recordings.options import DataOptions
 from gsstream.input.recordings.poses import from_rotation_vector, invert
 from gsstream.input.recordings.transformed import transformed
-from tests.input.recordings.scenes import write_video
+from tests.input.recordings.tiny_recordings import write_video
 
 WIDTH, HEIGHT = 96, 64
 NAMES = ("cam_0", "cam_1", "cam_2")

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from scenes import make_world, write_n3dv, write_video
+from tiny_recordings import make_world, write_n3dv, write_video
 
 from gsstream.core.errors import SourceError
 from gsstream.core.storage import unpacked
@@ -178,7 +178,7 @@ def test_late_starts_and_unequal_lengths_are_told_with_the_setting_that_mends_th
 
 
 def test_numbered_images_are_laid_beside_each_other_by_number(tmp_path: Path) -> None:
-    from scenes import write_frames
+    from tiny_recordings import write_frames
 
     write_frames(tmp_path / "a", numbered(6), first=10)
     write_frames(tmp_path / "b", numbered(6)[2:], first=12)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from scenes import LAYOUTS, make_world, write_frames
+from tiny_recordings import LAYOUTS, make_world, write_frames
 
 from gsstream.engine.budget.memory import WAITING, waiting_memory
 from gsstream.input.recordings.base import Source

@@ -52,7 +52,10 @@ class FrameContext(Protocol):
         """Return the image [H, W, 3] of a camera in frame t, in [0, 1]."""
 
     def previous_image(self, view: int) -> torch.Tensor:
-        """Return the image [H, W, 3] of a camera in the frame that ``gaussians`` shows, in [0, 1]."""
+        """Return the image [H, W, 3] of a camera, in [0, 1], that frame t is compared with.
+
+        It is of the frame that ``gaussians`` shows, or showed before its last packet: what changed is worked on twice.
+        """
 
     def image_change(self, view: int) -> torch.Tensor:
         """Return [H, W, 3]: ``image`` minus ``previous_image`` in the tiles that changed, and 0 in the others."""

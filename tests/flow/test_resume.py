@@ -86,7 +86,9 @@ RUNS: dict[str, Run] = {
     "key packets, cut after one": Run(3, settings=PERIOD, shows=keys),
     "key packets of still frames, cut at an empty packet": Run(3, source=STILL, settings=PERIOD, shows=stands_still),
     "key packets of still frames, cut at the last": Run(4, source=STILL, settings=PERIOD, shows=stands_still),
-    "a pause": Run(4, source=paused, flags=("--scale", "0.25"), shows=stands_still),
+    "a pause, cut in the frame that works on": Run(2, source=paused, flags=("--scale", "0.25"), shows=stands_still),
+    "a pause, cut at an empty packet": Run(3, source=paused, flags=("--scale", "0.25"), shows=stands_still),
+    "a pause, cut after it": Run(4, source=paused, flags=("--scale", "0.25"), shows=stands_still),
     "disturbed, two cameras, one late": Run(
         2, source=f"disturbed:gain_amplitude=0.3,noise_sigma=8,lost_share=0.4,time_offset=test@1:{WORLD}",
         settings={"data__train_views": 2},
@@ -107,6 +109,7 @@ RUNS: dict[str, Run] = {
         12, source=DRIFTING, settings={**FOLLOWED, "codec__key_interval": 4}, shows=drifts
     ),
     "a lamp, cut at it": Run(7, source=LAMP, settings=FOLLOWED, shows=lit_in(7)),
+    "a lamp, cut in the frame after it": Run(8, source=LAMP, settings=FOLLOWED, shows=lit_in(7)),
     "a lamp between two looks, cut after it": Run(9, source=LAMP, settings=FOLLOWED, shows=lit_in(7)),
     "a lamp in the first later frame, cut at a look": Run(
         5, source=LAMP.replace("event=7", "event=1"), settings=FOLLOWED, shows=lit_in(1)

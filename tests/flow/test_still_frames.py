@@ -20,16 +20,41 @@ def kinds(out: Path) -> list[PacketKind]:
 def test_a_pause_costs_a_few_bytes_and_no_optimisation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     witness = Witness(monkeypatch)
     encode(tmp_path / "o", source=str(paused(tmp_path / "world")), method="s2gs-edge")
-    still = [PacketKind.EMPTY] * 2
-    assert kinds(tmp_path / "o") == [PacketKind.KEY, PacketKind.DELTA, *still, PacketKind.DELTA]
+    # What changed in frame 1 is worked on once more in frame 2.
+    assert kinds(tmp_path / "o") == [PacketKind.KEY, *[PacketKind.DELTA] * 2, PacketKind.EMPTY, PacketKind.DELTA]
     lines = metrics(tmp_path / "o")
-    assert [(line["iterations"], line["loss"]) for line in lines[2:4]] == [(0, 0.0), (0, 0.0)]
-    assert all(sum(line["bytes"].values()) <= 32 for line in lines[2:4])
-    before, paused_state = witness.states[1], witness.states[3]
+    assert (lines[3]["iterations"], lines[3]["loss"]) == (0, 0.0)
+    assert sum(lines[3]["bytes"].values()) <= 32
+    before, paused_state = witness.states[2], witness.states[3]
     for (name, a), (_, b) in zip(before.player.gaussians.items(), paused_state.player.gaussians.items(), strict=True):
         assert np.array_equal(a, b), name
-    # What the scene shows is still frame 1.
-    assert paused_state.previous.index == 1
+    # What the scene shows is still frame 2, and nothing older is compared with.
+    assert paused_state.previous.index == 2
+    assert [None if state.earlier is None else state.earlier.index for state in witness.states] == [
+        *(None, 0, 1, None, 2),
+    ]
+
+
+def test_what_changed_is_worked_on_once_more(tmp_path: Path) -> None:
+    """A leap is too much for the passes of one frame; nothing moves after it, and the next frame brings it nearer."""
+    world = demo_copy(tmp_path / "world", frames=5)
+    for camera in (path for path in world.iterdir() if path.is_dir()):
+        after = (camera / "000004.jpg").read_bytes()
+        for place in range(1, 4):
+            (camera / f"{place:06d}.jpg").write_bytes(after)
+    encode(tmp_path / "o", source=str(world), method="s2gs-edge")
+    assert kinds(tmp_path / "o") == [PacketKind.KEY, *[PacketKind.DELTA] * 2, *[PacketKind.EMPTY] * 2]
+    (moving,) = zip(*(line["psnr_moving"].values() for line in metrics(tmp_path / "o")[1:]), strict=True)
+    assert moving[1] > moving[0] + 0.1
+    assert moving[1] == moving[2] == moving[3]
+
+
+def test_where_everything_takes_part_a_frame_is_compared_with_the_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    witness = Witness(monkeypatch)
+    encode(tmp_path / "o", method="s2gs-edge", stream__change_threshold=0)
+    assert {state.earlier for state in witness.states} == {None}
 
 
 def test_a_fade_too_slow_to_see_from_frame_to_frame_is_seen_in_the_end(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,14 +11,17 @@ import numpy as np
 import torch
 
 from gsstream.core.errors import OutputError, PacketError
+from gsstream.core.frame import Frame
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.names import without_places
 from gsstream.core.rng import Rng
+from gsstream.core.storage import packed
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import decoded_anchors, memory_across_key, shell_behind
 from gsstream.engine.frame0.refine import SHOWN, advance_refinement, is_to_be_refined, start_refinement
 from gsstream.engine.state.colour_maps import exposure_from_meta, gains_from_meta
 from gsstream.engine.state.stream_state import Refinement, StreamState, next_state
+from gsstream.engine.step.frame_step import looks_back
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.method.tools import Tools
 from gsstream.packet import PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet
@@ -42,13 +46,17 @@ def read_end(path: Path, last: int | None = None) -> Ended:
     for player, kind in _decoded_states(path, last):
         if kind == PacketKind.KEY:
             key = player.frame
-            # A key packet says which picture its scene shows: it may stand for an older one.
-            shown = int(player.meta.extra.get(SHOWN, player.frame))
+            shown = shown_by_key(player)
         elif player.delta is not None and not player.delta.is_light_at_most:
             shown = player.frame
     if player is None:
         raise PacketError("the first key packet of the stream is damaged", 0)
     return Ended(player, shown, key)
+
+
+def shown_by_key(player: PlayerState) -> int:
+    """Return the frame whose pictures the scene of a key packet shows: it may stand for an older one, and says so."""
+    return int(player.meta.extra.get(SHOWN, player.frame))
 
 
 def states_since_key(path: Path, end: Ended) -> Iterator[PlayerState]:
@@ -95,6 +103,27 @@ def state_after(assembly: Assembly, states: Iterable[PlayerState], rng: Rng) -> 
             state = next_state(assembly.motion, state, player, rng)
     assert state is not None, "a stream without a key packet"
     return state
+
+
+def earlier_pictures(assembly: Assembly, tools: Tools) -> Frame | None:
+    """Return the pictures that the scene showed before the last packet; None where the next frame does not look back.
+
+    It does where that packet changed the scene, and no lamp was switched in it or since the scene last changed.
+    """
+    shown, earlier, lamps = -1, None, False
+    for player in tools.since_key():
+        if shown < 0:
+            shown = shown_by_key(player)
+            continue
+        lamps = lamps or (player.delta is not None and player.delta.light is not None)
+        if player.delta is None or player.delta.is_light_at_most:
+            earlier = None
+        else:
+            earlier, shown, lamps = None if lamps else shown, player.frame, False
+    if earlier is None or not looks_back(assembly):
+        return None
+    frame = tools.recorded(earlier)
+    return replace(frame, images=packed(frame.images))
 
 
 def refinement_after(assembly: Assembly, state: StreamState, tools: Tools) -> Refinement | None:

@@ -19,7 +19,7 @@ from gsstream.engine.frame0.refine import (
 )
 from gsstream.engine.frame0.reuse import reuse_first_frame
 from gsstream.engine.keys.keyframes import key_packet_if_due
-from gsstream.engine.keys.resume import refinement_after, state_after
+from gsstream.engine.keys.resume import earlier_pictures, refinement_after, state_after
 from gsstream.engine.state.stream_state import Step, StreamState
 from gsstream.engine.step.frame_step import frame_step
 from gsstream.engine.step.lamp import resumed_in_light
@@ -77,6 +77,7 @@ class PartsMethod(StreamingMethod[StreamState]):
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> StreamState:
         state = replace(state_after(self.slots, tools.since_key(), tools.rng), previous=shown)
+        state = replace(state, earlier=earlier_pictures(self.slots, tools))
         state = resumed_in_light(state, tools.since_key())
         state = looked_after(self.slots, state, tools.since_key(), tools)
         return replace(state, refinement=refinement_after(self.slots, state, tools))

@@ -45,11 +45,12 @@ class Refinement:
 
 
 class Resident(NamedTuple):
-    """The decoded scene, its groups and the images that it shows, on the renderer's device."""
+    """The decoded scene, its groups, and the images that it shows and showed before, on the renderer's device."""
 
     gaussians: Gaussians[torch.Tensor]
     hierarchy: Hierarchy
     images: FrameImages
+    earlier: FrameImages | None = None
 
 
 def updated(before: Gaussians[torch.Tensor], after: Gaussians[FloatArray], rows: IntArray) -> Gaussians[torch.Tensor]:
@@ -71,6 +72,9 @@ class StreamState:
     #: Training images of the last frame whose packet changed the scene: what the scene shows. As bytes
     #: where bytes hold them.
     previous: Frame
+    #: Those that the scene showed before the last packet, if that changed it. The next frame is compared with these, so
+    #: that what changed is worked on once more. None: it is compared with ``previous``.
+    earlier: Frame | None = None
     #: Linear decoders to continue from; equal to the player's once they were sent.
     decoders: Mapping[str, torch.Tensor] = field(default_factory=dict)
     exposure: Exposure | None = None  # colour maps of the training cameras, or None
@@ -97,6 +101,13 @@ class StreamState:
     def shown(self, device: torch.device) -> FrameImages:
         """Return the images that the scene shows, on a device."""
         return FrameImages(self.previous.images, device) if self.resident is None else self.resident.images
+
+    def compared(self, device: torch.device) -> FrameImages:
+        """Return the images that the next frame is compared with, on a device."""
+        if self.earlier is None:
+            return self.shown(device)
+        there = None if self.resident is None else self.resident.earlier
+        return FrameImages(self.earlier.images, device) if there is None else there
 
     def with_gains(self, gains: FloatArray) -> StreamState:
         """Return the state with cameras that have become brighter by these gains [C, 3] since the first frame."""

@@ -93,7 +93,9 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
             sent = relit(assembly, replace(state, player=had), work, sent, max_bytes=most)
     with log.phase("keep"):
         session, resident = keep(work, scene, sent.delta, sent.player)
-        kept = replace(shown_after(state, frame, sent.delta), session=session, resident=resident, lit=sent.lit)
+        kept = replace(
+            shown_after(assembly, state, frame, sent.delta), session=session, resident=resident, lit=sent.lit
+        )
         after = next_state(assembly.motion, kept, sent.player, rng)
     log.set(changed_tiles=1.0 if change is None else change.share, **step_numbers(solution, len(rows), session))
     if (schedule.timed or schedule.sized) and (len(rows) or scope is Scope.NONE):
@@ -101,22 +103,32 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
     return Step(after, replace(sent.packet, decoded=sent.player), "empty" if sent.delta.is_empty else "delta")
 
 
-def shown_after(state: StreamState, frame: Frame, delta: Delta) -> StreamState:
-    """Return the state with the pictures that the scene shows after a frame.
+def shown_after(assembly: Assembly, state: StreamState, frame: Frame, delta: Delta) -> StreamState:
+    """Return the state with the pictures that the scene shows after a frame, and those that it showed before.
 
     A frame that changed nothing, or the light alone, is not what the scene shows: the next one is compared with the
     last that did, so that a change too slow to see from frame to frame adds up until it is seen.
     """
     if delta.is_light_at_most:
-        return state
-    return replace(state, previous=replace(frame, images=packed(frame.images)), lamps=())
+        return replace(state, earlier=None)
+    earlier = state.previous if looks_back(assembly) and not state.lamps else None
+    return replace(state, previous=replace(frame, images=packed(frame.images)), earlier=earlier, lamps=())
+
+
+def looks_back(assembly: Assembly) -> bool:
+    """Say whether a frame is compared with what the scene showed before the last packet.
+
+    A frame's passes carry most of a change, not all. What changed is worked on in the frame after, too: nothing else
+    would mend it once it stands still. Where everything takes part in every frame there is nothing to work on longer.
+    """
+    return assembly.recipe.stream.change_threshold > 0
 
 
 def find_change(renderer: Renderer, state: StreamState, images: FrameImages, threshold: float) -> Change | None:
-    """Return what changed since the frame that the scene shows; None where the threshold is 0: then everything did."""
+    """Return what changed since the frame it is compared with; None where the threshold is 0: then everything did."""
     if threshold == 0:
         return None
-    return renderer.find_change(state.shown(images.device).all_stored(), images.all_stored(), threshold)
+    return renderer.find_change(state.compared(images.device).all_stored(), images.all_stored(), threshold)
 
 
 def empty_step(state: StreamState, frame: Frame, log: FrameLog) -> Step:
@@ -126,7 +138,7 @@ def empty_step(state: StreamState, frame: Frame, log: FrameLog) -> Step:
         player = decode_packet(state.player, packet.data)
     # No part and no renderer is called here, because this step is also made after a part has failed.
     log.set(changed_tiles=0.0, **step_numbers(None, 0, None))
-    return Step(replace(state, player=player), replace(packet, decoded=player), "empty")
+    return Step(replace(state, player=player, earlier=None), replace(packet, decoded=player), "empty")
 
 
 def with_growth(assembly: Assembly, state: StreamState, delta: Delta, work: EngineContext, rng: Rng) -> Delta:
@@ -206,4 +218,5 @@ def keep(
     session = work.session.commit(gaussians, torch.from_numpy(rows).to(gaussians.means.device))
     if work.images.device.type == "cpu":
         return session, None
-    return session, Resident(gaussians, work.hierarchy, work.previous_images if delta.is_light_at_most else work.images)
+    shown = work.shown_images
+    return session, Resident(gaussians, work.hierarchy, shown if delta.is_light_at_most else work.images, shown)

@@ -137,6 +137,7 @@ def in_light(state: StreamState, light: Light) -> StreamState:
         state,
         player=lit_player(state.player, light),
         previous=lit_frame(state.previous, light),
+        earlier=None,
         lamps=(*state.lamps, light),
         lit=_lit(state).in_light(light.factor),
         session=None,

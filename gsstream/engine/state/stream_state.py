@@ -72,9 +72,6 @@ class StreamState:
     #: Training images of the last frame whose packet changed the scene: what the scene shows. As bytes
     #: where bytes hold them.
     previous: Frame
-    #: Those that the scene showed before the last packet, if that changed it. The next frame is compared with these, so
-    #: that what changed is worked on once more. None: it is compared with ``previous``.
-    earlier: Frame | None = None
     #: Linear decoders to continue from; equal to the player's once they were sent.
     decoders: Mapping[str, torch.Tensor] = field(default_factory=dict)
     exposure: Exposure | None = None  # colour maps of the training cameras, or None
@@ -87,6 +84,9 @@ class StreamState:
     refinement: Refinement | None = None
     #: State of the motion part after the packets since the last key packet (``MotionPart.follow``).
     motion_memory: Any = None
+    #: Training images that the scene showed before the last packet, if that changed it. The next frame is compared
+    #: with these, so that what changed is worked on once more. None: it is compared with ``previous``.
+    earlier: Frame | None = None
     #: Lamps that were switched since ``previous``, in whose light it is.
     lamps: tuple[Light, ...] = ()
     #: The frame whose light the colours of what stands still have; None before the first that was looked at.

@@ -51,7 +51,7 @@ def key_packet_if_due(assembly: Assembly, step: Step, frame: Frame, tools: Tools
     if refused is not None:
         return _postponed(step, reason, refused, tools)
     if state.lamps:  # a key packet does not say in whose light an older picture is
-        state = replace(state, previous=replace(frame, images=packed(frame.images)), earlier=None, lamps=())
+        state = replace(state, previous=replace(frame, images=packed(frame.images)), lamps=())
     # A refined scene was fitted to the pictures of this frame; another may show older ones.
     assembly = replace(assembly, background=state.player.meta.background)  # a lamp may have been switched in this frame
     made, shown = (refined_key_step, frame) if reason == REFINED else (reencode_as_key, state.previous)
@@ -62,7 +62,7 @@ def key_packet_if_due(assembly: Assembly, step: Step, frame: Frame, tools: Tools
         return _postponed(step, reason, f"{len(after.packet.data)} bytes where {max_bytes} are allowed", tools)
     log_packet(tools.log, state.player, step.packet)  # what changed in the frame: the key packet does not say it
     tools.log.set(key_reason=reason)
-    return Step(replace(after.state, previous=shown, earlier=None), after.packet, "key")
+    return Step(replace(after.state, previous=shown), after.packet, "key")
 
 
 def _due(assembly: Assembly, step: Step) -> str | None:

@@ -45,12 +45,17 @@ class Refinement:
 
 
 class Resident(NamedTuple):
-    """The decoded scene, its groups, and the images that it shows and showed before, on the renderer's device."""
+    """The decoded scene and its groups on the renderer's device."""
 
     gaussians: Gaussians[torch.Tensor]
     hierarchy: Hierarchy
-    images: FrameImages
-    earlier: FrameImages | None = None
+
+
+class Pictures(NamedTuple):
+    """The images that the decoded scene shows, and those that the next frame is compared with, on a device."""
+
+    shown: FrameImages
+    compared: FrameImages
 
 
 def updated(before: Gaussians[torch.Tensor], after: Gaussians[FloatArray], rows: IntArray) -> Gaussians[torch.Tensor]:
@@ -94,20 +99,23 @@ class StreamState:
     #: What the renderer keeps of this scene from one frame to the next. Nothing but time depends on it: a state
     #: without one (the first, a resumed one) goes on to the same bytes.
     session: RenderSession | None = field(default=None, compare=False, repr=False)
-    #: The same scene and what it shows on the device of a renderer that works on a GPU; nothing but time depends on
-    #: it, either.
+    #: The same scene, and ``previous`` and ``earlier``, on the device of a renderer that works on a GPU; nothing but
+    #: time depends on them, either.
     resident: Resident | None = field(default=None, compare=False, repr=False)
+    pictures: Pictures | None = field(default=None, compare=False, repr=False)
 
-    def shown(self, device: torch.device) -> FrameImages:
-        """Return the images that the scene shows, on a device."""
-        return FrameImages(self.previous.images, device) if self.resident is None else self.resident.images
+    def pictures_on(self, device: torch.device) -> Pictures:
+        """Return the images that the scene shows, and those that the next frame is compared with, on a device."""
+        if self.pictures is not None:
+            return self.pictures
+        shown = FrameImages(self.previous.images, device)
+        return Pictures(shown, shown if self.earlier is None else FrameImages(self.earlier.images, device))
 
-    def compared(self, device: torch.device) -> FrameImages:
-        """Return the images that the next frame is compared with, on a device."""
-        if self.earlier is None:
-            return self.shown(device)
-        there = None if self.resident is None else self.resident.earlier
-        return FrameImages(self.earlier.images, device) if there is None else there
+    @property
+    def settled(self) -> StreamState:
+        """The state whose next frame is compared with what the scene shows."""
+        there = self.pictures
+        return replace(self, earlier=None, pictures=None if there is None else Pictures(there.shown, there.shown))
 
     def with_gains(self, gains: FloatArray) -> StreamState:
         """Return the state with cameras that have become brighter by these gains [C, 3] since the first frame."""

@@ -48,9 +48,9 @@ class EngineContext:
         resident = state.resident
         if resident is None:
             gaussians = state.player.gaussians.map(lambda value: torch.from_numpy(value).to(device))
-            resident = Resident(gaussians, state.hierarchy.to(device), state.shown(device))
-        self.gaussians, self.hierarchy, self.shown_images = resident[:3]
-        self.previous_images = state.compared(device)
+            resident = Resident(gaussians, state.hierarchy.to(device))
+        self.gaussians, self.hierarchy = resident
+        self.previous_images = state.pictures_on(device).compared
         self.index, self.cameras = frame.index, frame.cameras
         self._device, self._frame, self._change = device, frame, change
         self._previous, self._shell = state.previous, state.shell

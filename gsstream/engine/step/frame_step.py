@@ -24,7 +24,7 @@ from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.budget.epoch_scheduler import EpochScheduler
 from gsstream.engine.fit.photometric import FrameImages
 from gsstream.engine.state.drift import EVERY
-from gsstream.engine.state.stream_state import Resident, Step, StreamState, next_state, updated
+from gsstream.engine.state.stream_state import Pictures, Resident, Step, StreamState, next_state, updated
 from gsstream.engine.step.context import EngineContext
 from gsstream.engine.step.lamp import with_lamp
 from gsstream.engine.step.light import Sent, look, relit
@@ -54,6 +54,7 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
     with log.phase("change"):
         images = FrameImages(frame.images, assembly.renderer.device)
         had, (assembly, state, light) = state.player, with_lamp(assembly, state, frame, budget.max_bytes, log)
+        state = replace(state, pictures=state.pictures_on(images.device))
         change = find_change(assembly.renderer, state, images, threshold=budget.change_threshold)
         state, due = (state, False) if state.lit and frame.index % EVERY else look(assembly, state, frame, images, log)
     if change is not None and change.share == 0 and scope is not Scope.ALL and not due and light is None:
@@ -93,9 +94,8 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
             sent = relit(assembly, replace(state, player=had), work, sent, max_bytes=most)
     with log.phase("keep"):
         session, resident = keep(work, scene, sent.delta, sent.player)
-        kept = replace(
-            shown_after(assembly, state, frame, sent.delta), session=session, resident=resident, lit=sent.lit
-        )
+        shown = shown_after(assembly, state, frame, sent.delta, images)
+        kept = replace(shown, session=session, resident=resident, lit=sent.lit)
         after = next_state(assembly.motion, kept, sent.player, rng)
     log.set(changed_tiles=1.0 if change is None else change.share, **step_numbers(solution, len(rows), session))
     if (schedule.timed or schedule.sized) and (len(rows) or scope is Scope.NONE):
@@ -103,16 +103,21 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
     return Step(after, replace(sent.packet, decoded=sent.player), "empty" if sent.delta.is_empty else "delta")
 
 
-def shown_after(assembly: Assembly, state: StreamState, frame: Frame, delta: Delta) -> StreamState:
+def shown_after(assembly: Assembly, state: StreamState, frame: Frame, delta: Delta, images: FrameImages) -> StreamState:
     """Return the state with the pictures that the scene shows after a frame, and those that it showed before.
 
     A frame that changed nothing, or the light alone, is not what the scene shows: the next one is compared with the
     last that did, so that a change too slow to see from frame to frame adds up until it is seen.
     """
     if delta.is_light_at_most:
-        return replace(state, earlier=None)
+        return state.settled
     earlier = state.previous if looks_back(assembly) and not state.lamps else None
-    return replace(state, previous=replace(frame, images=packed(frame.images)), earlier=earlier, lamps=())
+    pictures = None
+    if images.device.type != "cpu":
+        before = state.pictures_on(images.device).shown
+        pictures = Pictures(images, images if earlier is None else before)
+    previous = replace(frame, images=packed(frame.images))
+    return replace(state, previous=previous, earlier=earlier, lamps=(), pictures=pictures)
 
 
 def looks_back(assembly: Assembly) -> bool:
@@ -128,7 +133,7 @@ def find_change(renderer: Renderer, state: StreamState, images: FrameImages, thr
     """Return what changed since the frame it is compared with; None where the threshold is 0: then everything did."""
     if threshold == 0:
         return None
-    return renderer.find_change(state.compared(images.device).all_stored(), images.all_stored(), threshold)
+    return renderer.find_change(state.pictures_on(images.device).compared.all_stored(), images.all_stored(), threshold)
 
 
 def empty_step(state: StreamState, frame: Frame, log: FrameLog) -> Step:
@@ -138,7 +143,7 @@ def empty_step(state: StreamState, frame: Frame, log: FrameLog) -> Step:
         player = decode_packet(state.player, packet.data)
     # No part and no renderer is called here, because this step is also made after a part has failed.
     log.set(changed_tiles=0.0, **step_numbers(None, 0, None))
-    return Step(replace(state, player=player, earlier=None), replace(packet, decoded=player), "empty")
+    return Step(replace(state.settled, player=player), replace(packet, decoded=player), "empty")
 
 
 def with_growth(assembly: Assembly, state: StreamState, delta: Delta, work: EngineContext, rng: Rng) -> Delta:
@@ -206,7 +211,7 @@ def keep(
     """Return the session of the decoded scene, with what did not change still projected, and the scene on its device.
 
     Nothing where keeping costs more than it saves: rows came or went, or most of them changed. On a processor the scene
-    is the player's own. Where the frame changed nothing, the scene shows the images that it showed before.
+    is the player's own.
     """
     # Where a delta is empty though something moved, not even the motions were sent.
     if delta.has_row_edit or (delta.is_light_at_most and scene.gaussians is not player.gaussians):
@@ -218,5 +223,4 @@ def keep(
     session = work.session.commit(gaussians, torch.from_numpy(rows).to(gaussians.means.device))
     if work.images.device.type == "cpu":
         return session, None
-    shown = work.shown_images
-    return session, Resident(gaussians, work.hierarchy, shown if delta.is_light_at_most else work.images, shown)
+    return session, Resident(gaussians, work.hierarchy)

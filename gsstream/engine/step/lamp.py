@@ -142,6 +142,7 @@ def in_light(state: StreamState, light: Light) -> StreamState:
         lit=_lit(state).in_light(light.factor),
         session=None,
         resident=None,
+        pictures=None,
     )
 
 

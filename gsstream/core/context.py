@@ -54,7 +54,8 @@ class FrameContext(Protocol):
     def previous_image(self, view: int) -> torch.Tensor:
         """Return the image [H, W, 3] of a camera, in [0, 1], that frame t is compared with.
 
-        It is of the frame that ``gaussians`` shows, or showed before its last packet: what changed is worked on twice.
+        It is of the frame that ``gaussians`` shows. Tiles that have not changed since are of the frame that it showed
+        before its last packet: what changed then is worked on once more.
         """
 
     def image_change(self, view: int) -> torch.Tensor:

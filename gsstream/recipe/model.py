@@ -114,9 +114,9 @@ class Stream(Section):
         default=0.0,
         ge=0,
         le=100,
-        description="tiles whose pixels differ from two frames before by more than this many sigmas of their own "
-        "spread count as changed, so that a change is worked on twice; only Gaussians visible in them take part, and "
-        "only until their gate has closed. 0: everything takes part to the end",
+        description="tiles whose pixels differ from the last frame, or the one before, by more than this many sigmas "
+        "of their own spread count as changed; only Gaussians visible in them take part, and only until their gate has "
+        "closed. 0: everything takes part to the end",
     )
     rd_lambda: float = Field(
         default=0.0,

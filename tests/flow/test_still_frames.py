@@ -49,6 +49,20 @@ def test_what_changed_is_worked_on_once_more(tmp_path: Path) -> None:
     assert moving[1] == moving[2] == moving[3]
 
 
+def test_what_goes_there_and_back_is_seen_to_change(tmp_path: Path) -> None:
+    """Frame 2 shows the pictures of frame 0, with which it is compared, too: it differs from frame 1 all the same."""
+    world = demo_copy(tmp_path / "world", frames=5)
+    for camera in (path for path in world.iterdir() if path.is_dir()):
+        shown = [(camera / f"{place:06d}.jpg").read_bytes() for place in range(2)]
+        for place in range(2, 5):
+            (camera / f"{place:06d}.jpg").write_bytes(shown[place % 2])
+    encode(tmp_path / "o", source=str(world), method="s2gs-edge")
+    assert kinds(tmp_path / "o") == [PacketKind.KEY, *[PacketKind.DELTA] * 4]
+    lines = metrics(tmp_path / "o")
+    # All of frame 3 has changed since frame 2: what changed in frame 2 is the same.
+    assert lines[3]["changed_tiles"] == lines[2]["changed_tiles"] == lines[1]["changed_tiles"] > 0
+
+
 def test_where_everything_takes_part_a_frame_is_compared_with_the_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,7 +13,7 @@ from gsstream.core.cameras import Cameras
 from gsstream.core.gaussians import Gaussians
 from gsstream.parts.backend.base import Renderer
 from gsstream.parts.render.exposure import Exposure
-from gsstream.parts.render.images import float_image
+from gsstream.parts.render.images import float_image, spread_to_pixels
 from gsstream.parts.render.loss import Loss
 from gsstream.parts.render.target import ViewTarget
 
@@ -40,6 +40,22 @@ class FrameImages:
     def all_stored(self) -> list[torch.Tensor]:
         """Return the images of all views as they are stored."""
         return [self.stored(view) for view in range(len(self))]
+
+
+class MixedImages(FrameImages):
+    """The images of one frame, and in some tiles those of another: mixed where they are asked for."""
+
+    def __init__(self, images: FrameImages, others: FrameImages, tiles: torch.Tensor) -> None:
+        """Take over both; ``tiles`` [V, ceil(H / 16), ceil(W / 16)] bool, where the others are shown."""
+        super().__init__(images, images.device)
+        self._others, self._tiles = others, tiles
+
+    def stored(self, view: int) -> torch.Tensor:
+        if view not in self._there:
+            image = self._images.stored(view)
+            here = spread_to_pixels(self._tiles[view], *image.shape[:2])[..., None]
+            self._there[view] = torch.where(here, self._others.stored(view), image)
+        return self._there[view]
 
 
 class PhotometricLoss:

@@ -52,10 +52,10 @@ class Resident(NamedTuple):
 
 
 class Pictures(NamedTuple):
-    """The images that the decoded scene shows, and those that the next frame is compared with, on a device."""
+    """The images that the decoded scene shows, and those that it showed before its last packet, on a device."""
 
     shown: FrameImages
-    compared: FrameImages
+    earlier: FrameImages | None = None
 
 
 def updated(before: Gaussians[torch.Tensor], after: Gaussians[FloatArray], rows: IntArray) -> Gaussians[torch.Tensor]:
@@ -90,7 +90,7 @@ class StreamState:
     #: State of the motion part after the packets since the last key packet (``MotionPart.follow``).
     motion_memory: Any = None
     #: Training images that the scene showed before the last packet, if that changed it. The next frame is compared
-    #: with these, so that what changed is worked on once more. None: it is compared with ``previous``.
+    #: with these, too, so that what changed is worked on once more. None: with ``previous`` alone.
     earlier: Frame | None = None
     #: Lamps that were switched since ``previous``, in whose light it is.
     lamps: tuple[Light, ...] = ()
@@ -105,17 +105,17 @@ class StreamState:
     pictures: Pictures | None = field(default=None, compare=False, repr=False)
 
     def pictures_on(self, device: torch.device) -> Pictures:
-        """Return the images that the scene shows, and those that the next frame is compared with, on a device."""
+        """Return the images that the next frame is compared with, on a device."""
         if self.pictures is not None:
             return self.pictures
-        shown = FrameImages(self.previous.images, device)
-        return Pictures(shown, shown if self.earlier is None else FrameImages(self.earlier.images, device))
+        earlier = None if self.earlier is None else FrameImages(self.earlier.images, device)
+        return Pictures(FrameImages(self.previous.images, device), earlier)
 
     @property
     def settled(self) -> StreamState:
-        """The state whose next frame is compared with what the scene shows."""
+        """The state whose next frame is compared with what the scene shows, and with nothing before that."""
         there = self.pictures
-        return replace(self, earlier=None, pictures=None if there is None else Pictures(there.shown, there.shown))
+        return replace(self, earlier=None, pictures=None if there is None else Pictures(there.shown))
 
     def with_gains(self, gains: FloatArray) -> StreamState:
         """Return the state with cameras that have become brighter by these gains [C, 3] since the first frame."""

@@ -31,7 +31,8 @@ class EngineContext:
     """One frame over a decoded scene (implements ``render.work.FitContext`` and ``method.tools.FrameTools``).
 
     Images are as recorded; gradients are backpropagated through the camera's colour map, so that parts need not know
-    it. ``change`` is what changed since the scene was shown; None: everything counts as changed.
+    it. ``change`` is what changed since the images ``before``, None: everything counts as changed; without ``before``
+    these are what the scene shows.
     """
 
     def __init__(
@@ -43,6 +44,7 @@ class EngineContext:
         change: Change | None = None,
         part_scale: float = 1.0,
         images: FrameImages | None = None,
+        before: FrameImages | None = None,
     ) -> None:
         self._assembly, device = assembly, assembly.renderer.device
         resident = state.resident
@@ -50,7 +52,7 @@ class EngineContext:
             gaussians = state.player.gaussians.map(lambda value: torch.from_numpy(value).to(device))
             resident = Resident(gaussians, state.hierarchy.to(device))
         self.gaussians, self.hierarchy = resident
-        self.previous_images = state.pictures_on(device).compared
+        self.previous_images = state.pictures_on(device).shown if before is None else before
         self.index, self.cameras = frame.index, frame.cameras
         self._device, self._frame, self._change = device, frame, change
         self._previous, self._shell = state.previous, state.shell

@@ -22,7 +22,7 @@ from gsstream.core.storage import packed
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.budget.epoch_scheduler import EpochScheduler
-from gsstream.engine.fit.photometric import FrameImages
+from gsstream.engine.fit.photometric import FrameImages, MixedImages
 from gsstream.engine.state.drift import EVERY
 from gsstream.engine.state.stream_state import Pictures, Resident, Step, StreamState, next_state, updated
 from gsstream.engine.step.context import EngineContext
@@ -55,12 +55,14 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
         images = FrameImages(frame.images, assembly.renderer.device)
         had, (assembly, state, light) = state.player, with_lamp(assembly, state, frame, budget.max_bytes, log)
         state = replace(state, pictures=state.pictures_on(images.device))
-        change = find_change(assembly.renderer, state, images, threshold=budget.change_threshold)
+        change, before = find_change(assembly.renderer, state, images, threshold=budget.change_threshold)
         state, due = (state, False) if state.lit and frame.index % EVERY else look(assembly, state, frame, images, log)
     if change is not None and change.share == 0 and scope is not Scope.ALL and not due and light is None:
         return empty_step(state, frame, log)
     with log.phase("motion"), deferred_checks(assembly.checks is not Checks.STEP):
-        motions, scene, work = propose_motion(assembly, state, frame, change=change, tools=tools, images=images)
+        motions, scene, work = propose_motion(
+            assembly, state, frame, change=change, tools=tools, images=images, before=before
+        )
     with log.phase("confidence"), deferred_checks(assembly.checks is not Checks.STEP):
         rows, logits = select(assembly, work, work.hierarchy, scope)
     with log.phase("optimise"):
@@ -114,14 +116,13 @@ def shown_after(assembly: Assembly, state: StreamState, frame: Frame, delta: Del
     earlier = state.previous if looks_back(assembly) and not state.lamps else None
     pictures = None
     if images.device.type != "cpu":
-        before = state.pictures_on(images.device).shown
-        pictures = Pictures(images, images if earlier is None else before)
+        pictures = Pictures(images, None if earlier is None else state.pictures_on(images.device).shown)
     previous = replace(frame, images=packed(frame.images))
     return replace(state, previous=previous, earlier=earlier, lamps=(), pictures=pictures)
 
 
 def looks_back(assembly: Assembly) -> bool:
-    """Say whether a frame is compared with what the scene showed before the last packet.
+    """Say whether a frame is compared with what the scene showed before the last packet, too.
 
     A frame's passes carry most of a change, not all. What changed is worked on in the frame after, too: nothing else
     would mend it once it stands still. Where everything takes part in every frame there is nothing to work on longer.
@@ -129,11 +130,27 @@ def looks_back(assembly: Assembly) -> bool:
     return assembly.recipe.stream.change_threshold > 0
 
 
-def find_change(renderer: Renderer, state: StreamState, images: FrameImages, threshold: float) -> Change | None:
-    """Return what changed since the frame it is compared with; None where the threshold is 0: then everything did."""
+class Found(NamedTuple):
+    """What changed, None for everything, and the images since which it did."""
+
+    change: Change | None
+    before: FrameImages
+
+
+def find_change(renderer: Renderer, state: StreamState, images: FrameImages, threshold: float) -> Found:
+    """Return what changed since the images that the scene shows or, in other tiles, since those that it showed before.
+
+    Everything did where the threshold is 0.
+    """
+    shown, earlier = state.pictures_on(images.device)
     if threshold == 0:
-        return None
-    return renderer.find_change(state.pictures_on(images.device).compared.all_stored(), images.all_stored(), threshold)
+        return Found(None, shown)
+    now = images.all_stored()
+    change = renderer.find_change(shown.all_stored(), now, threshold)
+    if earlier is None:
+        return Found(change, shown)
+    tiles = renderer.find_change(earlier.all_stored(), now, threshold).tiles
+    return Found(change.with_tiles(tiles), MixedImages(shown, earlier, tiles & ~change.tiles))
 
 
 def empty_step(state: StreamState, frame: Frame, log: FrameLog) -> Step:

@@ -39,13 +39,16 @@ def propose_motion(
     change: Change | None,
     tools: Tools,
     images: FrameImages | None = None,
+    before: FrameImages | None = None,
 ) -> Moved:
     """Ask the motion part, and apply what it proposes as every player will.
 
     Raises ComponentError when the part fails, or proposes motions that do not fit the scene or cannot be sent.
     """
     scene, budget = state.player.scene, tools.budget
-    work = EngineContext(assembly, state, frame, tools.log, change=change, part_scale=budget.part_scale, images=images)
+    work = EngineContext(
+        assembly, state, frame, tools.log, change=change, part_scale=budget.part_scale, images=images, before=before
+    )
     proposed = assembly.motion.propose(scene, work, tools.rng, state.motion_memory)
     motions = tuple(motion for motion in proposed if not motion.is_empty)
     if not motions:

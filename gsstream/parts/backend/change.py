@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
+from typing import Final, Self
 
 import torch
 from torch.nn.functional import max_pool2d, normalize, one_hot, pad
@@ -72,6 +72,10 @@ class Change:
     def share(self) -> float:
         """Share of changed tiles over all views."""
         return sum(self.per_view) / max(self.tiles.numel(), 1)
+
+    def with_tiles(self, tiles: torch.Tensor) -> Self:
+        """Return the change with these tiles, too: [V, ceil(H / 16), ceil(W / 16)] bool."""
+        return replace(self, tiles=self.tiles | tiles)
 
     @cached_property  # every iteration asks for it
     def dilated(self) -> torch.Tensor:

@@ -52,9 +52,11 @@ class MixedImages(FrameImages):
 
     def stored(self, view: int) -> torch.Tensor:
         if view not in self._there:
-            image = self._images.stored(view)
+            image, other = self._images.stored(view), self._others.stored(view)
+            if image.dtype != other.dtype:  # 1.0 is 255 in bytes
+                image, other = float_image(image), float_image(other)
             here = spread_to_pixels(self._tiles[view], *image.shape[:2])[..., None]
-            self._there[view] = torch.where(here, self._others.stored(view), image)
+            self._there[view] = torch.where(here, other, image)
         return self._there[view]
 
 

@@ -21,7 +21,7 @@ from gsstream.engine.frame0.begin import decoded_anchors, memory_across_key, she
 from gsstream.engine.frame0.refine import SHOWN, advance_refinement, is_to_be_refined, start_refinement
 from gsstream.engine.state.colour_maps import exposure_from_meta, gains_from_meta
 from gsstream.engine.state.stream_state import Refinement, StreamState, next_state
-from gsstream.engine.step.frame_step import looks_back
+from gsstream.engine.step.compared import looks_back
 from gsstream.input.recordings.base import SourceInfo
 from gsstream.method.tools import Tools
 from gsstream.packet import PacketKind, PlayerState, StreamMeta, StreamReader, decode_packet

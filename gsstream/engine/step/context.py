@@ -42,9 +42,9 @@ class EngineContext:
         frame: Frame,
         log: FrameLog,
         change: Change | None = None,
+        before: FrameImages | None = None,
         part_scale: float = 1.0,
         images: FrameImages | None = None,
-        before: FrameImages | None = None,
     ) -> None:
         self._assembly, device = assembly, assembly.renderer.device
         resident = state.resident

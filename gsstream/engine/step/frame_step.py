@@ -18,13 +18,13 @@ from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.log import FrameLog
 from gsstream.core.picture_size import far_weight
 from gsstream.core.rng import Rng
-from gsstream.core.storage import packed
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.assembly.checks import Checks
 from gsstream.engine.budget.epoch_scheduler import EpochScheduler
-from gsstream.engine.fit.photometric import FrameImages, MixedImages
+from gsstream.engine.fit.photometric import FrameImages
 from gsstream.engine.state.drift import EVERY
-from gsstream.engine.state.stream_state import Pictures, Resident, Step, StreamState, next_state, updated
+from gsstream.engine.state.stream_state import Resident, Step, StreamState, next_state, updated
+from gsstream.engine.step.compared import find_change, shown_after
 from gsstream.engine.step.context import EngineContext
 from gsstream.engine.step.lamp import with_lamp
 from gsstream.engine.step.light import Sent, look, relit
@@ -35,8 +35,6 @@ from gsstream.engine.step.problem import Problem
 from gsstream.engine.step.quantise import encode_frame, quantise_residual
 from gsstream.method.tools import Tools
 from gsstream.packet import PlayerState, decode_packet, encode_empty
-from gsstream.parts.backend.base import Renderer
-from gsstream.parts.backend.change import Change
 from gsstream.parts.growth.none import NoGrowth
 from gsstream.parts.render.session import RenderSession
 from gsstream.parts.update.base import Scope, scale_steps
@@ -52,17 +50,15 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
     if frame.epoch_scale == 0:  # a skipped frame: a source that is behind does not read its images
         return empty_step(state, frame, log)
     with log.phase("change"):
-        images = FrameImages(frame.images, assembly.renderer.device)
-        had, (assembly, state, light) = state.player, with_lamp(assembly, state, frame, budget.max_bytes, log)
+        images, most = FrameImages(frame.images, assembly.renderer.device), budget.max_bytes
+        had, (assembly, state, light) = state.player, with_lamp(assembly, state, frame, most, log)
         state = replace(state, pictures=state.pictures_on(images.device))
-        change, before = find_change(assembly.renderer, state, images, threshold=budget.change_threshold)
+        found = find_change(assembly.renderer, state, images, threshold=budget.change_threshold)
         state, due = (state, False) if state.lit and frame.index % EVERY else look(assembly, state, frame, images, log)
-    if change is not None and change.share == 0 and scope is not Scope.ALL and not due and light is None:
+    if found.share == 0 and scope is not Scope.ALL and not due and light is None:
         return empty_step(state, frame, log)
     with log.phase("motion"), deferred_checks(assembly.checks is not Checks.STEP):
-        motions, scene, work = propose_motion(
-            assembly, state, frame, change=change, tools=tools, images=images, before=before
-        )
+        motions, scene, work = propose_motion(assembly, state, frame, found=found, tools=tools, images=images)
     with log.phase("confidence"), deferred_checks(assembly.checks is not Checks.STEP):
         rows, logits = select(assembly, work, work.hierarchy, scope)
     with log.phase("optimise"):
@@ -88,7 +84,7 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
     with log.phase("growth"):
         delta = with_growth(assembly, state, Delta(motions).with_residual(residual), work=work, rng=rng)
     with log.phase("code"):
-        trim, most, delta = assembly.recipe.codec.trim, budget.max_bytes, delta.with_light(light)
+        trim, delta = assembly.recipe.codec.trim, delta.with_light(light)
         fitted = encode_frame(delta, had, frame.index, solution=solution, trim=trim, max_bytes=most)
         sent = Sent(fitted.delta, fitted.packet, decode_packet(had, fitted.packet.data), state.lit)
     if due:
@@ -99,58 +95,10 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
         shown = shown_after(assembly, state, frame, sent.delta, images)
         kept = replace(shown, session=session, resident=resident, lit=sent.lit)
         after = next_state(assembly.motion, kept, sent.player, rng)
-    log.set(changed_tiles=1.0 if change is None else change.share, **step_numbers(solution, len(rows), session))
+    log.set(changed_tiles=found.share, **step_numbers(solution, len(rows), session))
     if (schedule.timed or schedule.sized) and (len(rows) or scope is Scope.NONE):
         log.set(budget=schedule.usage(fitted))
     return Step(after, replace(sent.packet, decoded=sent.player), "empty" if sent.delta.is_empty else "delta")
-
-
-def shown_after(assembly: Assembly, state: StreamState, frame: Frame, delta: Delta, images: FrameImages) -> StreamState:
-    """Return the state with the pictures that the scene shows after a frame, and those that it showed before.
-
-    A frame that changed nothing, or the light alone, is not what the scene shows: the next one is compared with the
-    last that did, so that a change too slow to see from frame to frame adds up until it is seen.
-    """
-    if delta.is_light_at_most:
-        return state.settled
-    earlier = state.previous if looks_back(assembly) and not state.lamps else None
-    pictures = None
-    if images.device.type != "cpu":
-        pictures = Pictures(images, None if earlier is None else state.pictures_on(images.device).shown)
-    previous = replace(frame, images=packed(frame.images))
-    return replace(state, previous=previous, earlier=earlier, lamps=(), pictures=pictures)
-
-
-def looks_back(assembly: Assembly) -> bool:
-    """Say whether a frame is compared with what the scene showed before the last packet, too.
-
-    A frame's passes carry most of a change, not all. What changed is worked on in the frame after, too: nothing else
-    would mend it once it stands still. Where everything takes part in every frame there is nothing to work on longer.
-    """
-    return assembly.recipe.stream.change_threshold > 0
-
-
-class Found(NamedTuple):
-    """What changed, None for everything, and the images since which it did."""
-
-    change: Change | None
-    before: FrameImages
-
-
-def find_change(renderer: Renderer, state: StreamState, images: FrameImages, threshold: float) -> Found:
-    """Return what changed since the images that the scene shows or, in other tiles, since those that it showed before.
-
-    Everything did where the threshold is 0.
-    """
-    shown, earlier = state.pictures_on(images.device)
-    if threshold == 0:
-        return Found(None, shown)
-    now = images.all_stored()
-    change = renderer.find_change(shown.all_stored(), now, threshold)
-    if earlier is None:
-        return Found(change, shown)
-    tiles = renderer.find_change(earlier.all_stored(), now, threshold).tiles
-    return Found(change.with_tiles(tiles), MixedImages(shown, earlier, tiles & ~change.tiles))
 
 
 def empty_step(state: StreamState, frame: Frame, log: FrameLog) -> Step:

@@ -13,11 +13,11 @@ from gsstream.core.frame import Frame
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.photometric import FrameImages
 from gsstream.engine.state.stream_state import StreamState, updated
+from gsstream.engine.step.compared import Found
 from gsstream.engine.step.context import EngineContext
 from gsstream.method.tools import Tools
 from gsstream.packet.changes.field import encode_field
 from gsstream.packet.changes.motion import encode_motions
-from gsstream.parts.backend.change import Change
 from gsstream.parts.update.base import Scope
 
 #: Largest share of the bytes a frame may take that its motions may take, where a residual follows them.
@@ -36,19 +36,16 @@ def propose_motion(
     assembly: Assembly,
     state: StreamState,
     frame: Frame,
-    change: Change | None,
+    found: Found,
     tools: Tools,
     images: FrameImages | None = None,
-    before: FrameImages | None = None,
 ) -> Moved:
     """Ask the motion part, and apply what it proposes as every player will.
 
     Raises ComponentError when the part fails, or proposes motions that do not fit the scene or cannot be sent.
     """
     scene, budget = state.player.scene, tools.budget
-    work = EngineContext(
-        assembly, state, frame, tools.log, change=change, part_scale=budget.part_scale, images=images, before=before
-    )
+    work = EngineContext(assembly, state, frame, tools.log, *found, part_scale=budget.part_scale, images=images)
     proposed = assembly.motion.propose(scene, work, tools.rng, state.motion_memory)
     motions = tuple(motion for motion in proposed if not motion.is_empty)
     if not motions:

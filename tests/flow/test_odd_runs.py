@@ -12,7 +12,7 @@ from flow_runs import Witness, arguments, encode, metrics
 
 from gsstream.cli.main import run_command
 from gsstream.engine.run import encoder
-from gsstream.engine.step import frame_step
+from gsstream.engine.step import compared
 from gsstream.input.recordings.canonical import CanonicalSource
 from gsstream.input.recordings.open import open_source
 from gsstream.player.playback import Playback
@@ -40,7 +40,7 @@ def test_images_as_bytes_lose_nothing_of_8_bits(tmp_path: Path, monkeypatch: pyt
         with monkeypatch.context() as patch:
             if waiting == "float32":
                 patch.setattr(CanonicalSource, "stored_frame", CanonicalSource.frame)
-                for module in (encoder, frame_step):
+                for module in (encoder, compared):
                     patch.setattr(module, "packed", lambda images: images)
             encode(tmp_path / waiting, "--frames", "4", method=method)
         with Playback(tmp_path / waiting / "stream.gss") as playback:

@@ -13,6 +13,8 @@ import torch
 from gsstream.core.cameras import Cameras
 from gsstream.core.picture_size import enlargement, far_weight
 from gsstream.core.rng import Rng
+from gsstream.engine.fit.photometric import FrameImages
+from gsstream.engine.step.compared import Found
 from gsstream.engine.step.context import EngineContext
 from gsstream.engine.step.motion import Moved, propose_motion
 from gsstream.engine.step.tools import RunTools
@@ -149,7 +151,8 @@ def within(max_bytes: int | None) -> Moved:
     budget = FrameBudget(epochs=1, change_threshold=6.0, rd_lambda=0.0, max_bytes=max_bytes)
     change = find_change(*(list(map(torch.from_numpy, each.images)) for each in (state.previous, frame)), 6.0)
     tools = RunTools(parts, Rng(0), Mock(), Mock(), budget=budget)
-    return propose_motion(parts, state, frame, change, tools)
+    before = FrameImages(state.previous.images, torch.device("cpu"))
+    return propose_motion(parts, state, frame, Found(change, before), tools)
 
 
 @pytest.mark.parametrize("spare", [0, -1])

@@ -10,7 +10,7 @@ import numpy as np
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import ShapeError
 from gsstream.core.shapes import FloatArray, as_array, check_shape
-from gsstream.core.storage import unpacked
+from gsstream.core.storage import packed, unpacked
 
 #: How far outside [0, 1] an image may be: the rounding error of resampling in float32.
 ROUNDING = 1e-4
@@ -141,3 +141,8 @@ class PointCloud:
 
     def __len__(self) -> int:
         return int(self.xyz.shape[0])
+
+
+def packed_frame(frame: Frame) -> Frame:
+    """Return the frame as it waits: with images of uint8 where these have the same bits."""
+    return replace(frame, images=packed(frame.images))

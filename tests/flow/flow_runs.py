@@ -7,7 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -91,12 +91,12 @@ def demo_copy(
 SHOWN = (0, 1, 1, 1, 2)
 
 
-def paused(folder: Path) -> Path:
-    """A copy of the demo that repeats frame 1, image file by image file."""
-    demo_copy(folder, frames=len(SHOWN))
+def paused(folder: Path, shown: Sequence[int] = SHOWN) -> Path:
+    """A copy of the demo that shows these of its frames, image file by image file."""
+    demo_copy(folder, frames=len(shown))
     for camera in (path for path in folder.iterdir() if path.is_dir()):
-        originals = {i: (camera / f"{i:06d}.jpg").read_bytes() for i in set(SHOWN)}
-        for place, i in enumerate(SHOWN):
+        originals = {i: (camera / f"{i:06d}.jpg").read_bytes() for i in set(shown)}
+        for place, i in enumerate(shown):
             (camera / f"{place:06d}.jpg").write_bytes(originals[i])
     return folder
 

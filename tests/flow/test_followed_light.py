@@ -156,8 +156,7 @@ def test_a_camera_that_drifts_alone_is_told_and_takes_nothing_of_the_test_camera
     named = "alone: cam02 -12.5/-12.5/-12.5 %"
     assert scene == "dim" or named in (drifts / "summary.txt").read_text()
     assert "alone" not in (alone / "summary.txt").read_text()
-    # Of rooms this small two draws differ by a tenth of a decibel.
-    assert quality(drifts, slice(16, 26)) > quality(alone, slice(16, 26)) - 0.2
+    assert quality(drifts, slice(16, 26)) > quality(alone, slice(16, 26)) - 0.1
 
 
 def test_a_camera_that_gets_so_bright_that_it_is_clipped_is_told_by_what_is_not(rooms: Rooms) -> None:

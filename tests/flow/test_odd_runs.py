@@ -11,8 +11,7 @@ from early_densify import densifying
 from flow_runs import Witness, arguments, encode, metrics
 
 from gsstream.cli.main import run_command
-from gsstream.engine.run import encoder
-from gsstream.engine.step import compared
+from gsstream.core import frame as core_frame
 from gsstream.input.recordings.canonical import CanonicalSource
 from gsstream.input.recordings.open import open_source
 from gsstream.player.playback import Playback
@@ -40,8 +39,7 @@ def test_images_as_bytes_lose_nothing_of_8_bits(tmp_path: Path, monkeypatch: pyt
         with monkeypatch.context() as patch:
             if waiting == "float32":
                 patch.setattr(CanonicalSource, "stored_frame", CanonicalSource.frame)
-                for module in (encoder, compared):
-                    patch.setattr(module, "packed", lambda images: images)
+                patch.setattr(core_frame, "packed", lambda images: images)
             encode(tmp_path / waiting, "--frames", "4", method=method)
         with Playback(tmp_path / waiting / "stream.gss") as playback:
             scenes.append([playback.state_at(frame).means.tobytes() for frame in playback.frames])

@@ -106,6 +106,11 @@ def with_time_for_keys(recipe: Recipe, state: StreamState, frame: Frame) -> Stre
     return replace(state, refinement=None) if late else state
 
 
+def shown_by_key(player: PlayerState) -> int:
+    """Return the frame whose pictures the scene of a key packet shows: it may stand for an older one, and says so."""
+    return int(player.meta.extra.get(SHOWN, player.frame))
+
+
 def is_to_be_refined(stream: Stream, player: PlayerState) -> bool:
     """Say whether the scene of the last key packet is to be refined: that of the first frame, where the recipe asks."""
     return stream.refine_frames > 0 and SHOWN not in player.meta.extra

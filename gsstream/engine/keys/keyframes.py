@@ -10,10 +10,9 @@ from dataclasses import replace
 
 import torch
 
-from gsstream.core.frame import Frame
+from gsstream.core.frame import Frame, packed_frame
 from gsstream.core.gaussians import Gaussians
 from gsstream.core.rng import Rng
-from gsstream.core.storage import packed
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import decoded_anchors, key_meta, key_state, make_layout, sort_into_nodes
 from gsstream.engine.frame0.first_layer import first_layer_mask
@@ -51,7 +50,7 @@ def key_packet_if_due(assembly: Assembly, step: Step, frame: Frame, tools: Tools
     if refused is not None:
         return _postponed(step, reason, refused, tools)
     if state.lamps:  # a key packet does not say in whose light an older picture is
-        state = replace(state, previous=replace(frame, images=packed(frame.images)), lamps=())
+        state = replace(state, previous=packed_frame(frame), lamps=())
     # A refined scene was fitted to the pictures of this frame; another may show older ones.
     assembly = replace(assembly, background=state.player.meta.background)  # a lamp may have been switched in this frame
     made, shown = (refined_key_step, frame) if reason == REFINED else (reencode_as_key, state.previous)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,14 +10,13 @@ import numpy as np
 import torch
 
 from gsstream.core.errors import OutputError, PacketError
-from gsstream.core.frame import Frame
+from gsstream.core.frame import Frame, packed_frame
 from gsstream.core.hierarchy import Hierarchy
 from gsstream.core.names import without_places
 from gsstream.core.rng import Rng
-from gsstream.core.storage import packed
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.frame0.begin import decoded_anchors, memory_across_key, shell_behind
-from gsstream.engine.frame0.refine import SHOWN, advance_refinement, is_to_be_refined, start_refinement
+from gsstream.engine.frame0.refine import advance_refinement, is_to_be_refined, shown_by_key, start_refinement
 from gsstream.engine.state.colour_maps import exposure_from_meta, gains_from_meta
 from gsstream.engine.state.stream_state import Refinement, StreamState, next_state
 from gsstream.engine.step.compared import looks_back
@@ -52,11 +50,6 @@ def read_end(path: Path, last: int | None = None) -> Ended:
     if player is None:
         raise PacketError("the first key packet of the stream is damaged", 0)
     return Ended(player, shown, key)
-
-
-def shown_by_key(player: PlayerState) -> int:
-    """Return the frame whose pictures the scene of a key packet shows: it may stand for an older one, and says so."""
-    return int(player.meta.extra.get(SHOWN, player.frame))
 
 
 def states_since_key(path: Path, end: Ended) -> Iterator[PlayerState]:
@@ -122,8 +115,7 @@ def earlier_pictures(assembly: Assembly, tools: Tools) -> Frame | None:
             earlier, shown, lamps = None if lamps else shown, player.frame, False
     if earlier is None or not looks_back(assembly):
         return None
-    frame = tools.recorded(earlier)
-    return replace(frame, images=packed(frame.images))
+    return packed_frame(tools.recorded(earlier))
 
 
 def refinement_after(assembly: Assembly, state: StreamState, tools: Tools) -> Refinement | None:

@@ -14,11 +14,10 @@ from typing import Any, Literal, cast
 import torch
 
 from gsstream.core.errors import InputError
-from gsstream.core.frame import Frame, PointCloud
+from gsstream.core.frame import Frame, PointCloud, packed_frame
 from gsstream.core.log import FrameLog
 from gsstream.core.names import last_part, without_places
 from gsstream.core.rng import Rng
-from gsstream.core.storage import packed
 from gsstream.core.world import snap_cameras
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.budget.controller import Controller
@@ -184,12 +183,10 @@ class Encoder:
         meta = end.player.meta
         self.assembly = replace(self.assembly, title=meta.title, background=meta.background)
         # The last one is kept, because the frame that the scene shows may be asked for once more.
-        recorded = lru_cache(maxsize=1)(lambda index: self.with_near_plane(image(index)))
+        recorded = lru_cache(maxsize=1)(lambda index: self.with_near_plane(image(index)).as_stored())
         tools = self._tools(replay=lambda: states_since_key(stream, end), recorded=recorded)
         with one_torch_thread():
-            shown = recorded(end.shown)
-            shown = replace(shown, images=packed(shown.images))
-            self.state = run_resume(self.method, end.player, shown, tools)
+            self.state = run_resume(self.method, end.player, packed_frame(recorded(end.shown)), tools)
         return end.player.frame
 
     def with_near_plane(self, frame: Frame) -> Frame:

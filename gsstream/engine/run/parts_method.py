@@ -76,8 +76,8 @@ class PartsMethod(StreamingMethod[StreamState]):
         )
 
     def resume(self, player: PlayerState, shown: Frame, tools: Tools) -> StreamState:
-        state = replace(state_after(self.slots, tools.since_key(), tools.rng), previous=shown)
-        state = replace(state, earlier=earlier_pictures(self.slots, tools))
+        earlier = earlier_pictures(self.slots, tools)
+        state = replace(state_after(self.slots, tools.since_key(), tools.rng), previous=shown, earlier=earlier)
         state = resumed_in_light(state, tools.since_key())
         state = looked_after(self.slots, state, tools.since_key(), tools)
         return replace(state, refinement=refinement_after(self.slots, state, tools))

@@ -11,8 +11,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from gsstream.core.changes import Delta
-from gsstream.core.frame import Frame
-from gsstream.core.storage import packed
+from gsstream.core.frame import Frame, packed_frame
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.photometric import FrameImages, MixedImages
 from gsstream.engine.state.stream_state import Pictures, StreamState
@@ -33,11 +32,6 @@ class Found(NamedTuple):
 
     change: Change | None
     before: FrameImages
-
-    @property
-    def share(self) -> float:
-        """Share of changed tiles over all views."""
-        return 1.0 if self.change is None else self.change.share
 
 
 def find_change(renderer: Renderer, state: StreamState, images: FrameImages, threshold: float) -> Found:
@@ -68,5 +62,4 @@ def shown_after(assembly: Assembly, state: StreamState, frame: Frame, delta: Del
     pictures = None
     if images.device.type != "cpu":
         pictures = Pictures(images, None if earlier is None else state.pictures_on(images.device).shown)
-    previous = replace(frame, images=packed(frame.images))
-    return replace(state, previous=previous, earlier=earlier, lamps=(), pictures=pictures)
+    return replace(state, previous=packed_frame(frame), earlier=earlier, lamps=(), pictures=pictures)

@@ -55,7 +55,8 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
         state = replace(state, pictures=state.pictures_on(images.device))
         found = find_change(assembly.renderer, state, images, threshold=budget.change_threshold)
         state, due = (state, False) if state.lit and frame.index % EVERY else look(assembly, state, frame, images, log)
-    if found.share == 0 and scope is not Scope.ALL and not due and light is None:
+    share = 1.0 if found.change is None else found.change.share
+    if share == 0 and scope is not Scope.ALL and not due and light is None:
         return empty_step(state, frame, log)
     with log.phase("motion"), deferred_checks(assembly.checks is not Checks.STEP):
         motions, scene, work = propose_motion(assembly, state, frame, found=found, tools=tools, images=images)
@@ -95,7 +96,7 @@ def frame_step(assembly: Assembly, state: StreamState, frame: Frame, tools: Tool
         shown = shown_after(assembly, state, frame, sent.delta, images)
         kept = replace(shown, session=session, resident=resident, lit=sent.lit)
         after = next_state(assembly.motion, kept, sent.player, rng)
-    log.set(changed_tiles=found.share, **step_numbers(solution, len(rows), session))
+    log.set(changed_tiles=share, **step_numbers(solution, len(rows), session))
     if (schedule.timed or schedule.sized) and (len(rows) or scope is Scope.NONE):
         log.set(budget=schedule.usage(fitted))
     return Step(after, replace(sent.packet, decoded=sent.player), "empty" if sent.delta.is_empty else "delta")

@@ -25,7 +25,7 @@ from gsstream.core.shapes import FloatArray
 from gsstream.core.storage import packed
 from gsstream.engine.assembly.assemble import Assembly
 from gsstream.engine.fit.photometric import FrameImages
-from gsstream.engine.frame0.refine import SHOWN
+from gsstream.engine.frame0.refine import shown_by_key
 from gsstream.engine.state.drift import EVERY, Lit, drift, looked_at
 from gsstream.engine.state.stream_state import StreamState
 from gsstream.engine.step.context import EngineContext
@@ -92,8 +92,8 @@ def looked_after(assembly: Assembly, state: StreamState, players: Iterable[Playe
     found, before = state, None
     for player in players:
         if before is None:
-            shown = int(player.meta.extra.get(SHOWN, player.frame))
-            images = FrameImages(packed(tools.recorded(shown).as_stored().images), assembly.renderer.device)
+            shown = shown_by_key(player)
+            images = FrameImages(packed(tools.recorded(shown).images), assembly.renderer.device)
             found = replace(found, lit=looked_at(shown, images, found.gains))
             before = player
             continue
@@ -101,7 +101,7 @@ def looked_after(assembly: Assembly, state: StreamState, players: Iterable[Playe
             lamp = player.delta.light
             found, before = replace(found, lit=found.lit.in_light(lamp.factor)), lit_player(before, lamp)
         if player.frame % EVERY == 0:
-            frame = tools.recorded(player.frame).as_stored()
+            frame = tools.recorded(player.frame)
             if frame.epoch_scale:  # a frame that was skipped was not looked at
                 images = FrameImages(frame.images, assembly.renderer.device)
                 there = replace(assembly, background=before.meta.background)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.errors import SourceError
-from gsstream.core.frame import Arrival, Frame, PointCloud
+from gsstream.core.frame import Arrival, Frame, PointCloud, packed_frame
 from gsstream.core.shapes import FloatArray
 from gsstream.core.storage import packed, unpacked
 from gsstream.core.world import IDENTITY, World
@@ -98,8 +98,7 @@ class Source(ABC):
 
     def stored_frame(self, index: int, split: Split = "train") -> Frame:
         """Return what ``frame`` does, with images of uint8 where that has the same bits for all of them."""
-        frame = self.frame(index, split)
-        return replace(frame, images=packed(frame.images))
+        return packed_frame(self.frame(index, split))
 
     @property
     def stores_bytes(self) -> bool:

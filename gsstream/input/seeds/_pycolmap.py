@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 # Read when the libraries of pycolmap are loaded. How many threads their linear algebra takes depends on what other
-# threads do at that moment, and the last bits of its sums on that number. Pictures and pairs are still worked on at the
-# same time, by threads of COLMAP's own.
+# threads do at that moment, and the last bits of its sums on that number. Pictures are still worked on at the
+# same time, by threads of COLMAP's own; pairs are matched one after the other (`match_pairs`).
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 import pycolmap

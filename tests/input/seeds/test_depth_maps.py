@@ -209,6 +209,38 @@ def test_no_number_of_threads_changes_a_bit_of_a_point(tmp_path: Path) -> None:
     assert len(set(found)) == 1
 
 
+@pytest.mark.sfm
+@needs_pycolmap
+def test_the_same_features_are_matched_alike_twenty_times(tmp_path: Path) -> None:
+    """Several threads of pycolmap's matching disturb each other, now and then: one matching in fifty came out other."""
+    sfm.write_images(tmp_path, SyntheticSource.from_query("width=320&height=240&views=8").frame(0).images)
+    code = (
+        "import sys, hashlib, shutil, zlib\n"
+        "from pathlib import Path\n"
+        "from gsstream.input.seeds import _features, _pycolmap\n"
+        "import numpy as np\n"
+        "here = Path(sys.argv[1])\n"
+        "_features.processors = lambda: 4\n"
+        "database = _features.extract(here, most=2048)\n"
+        "for turn in range(20):\n"
+        "    again = Path(shutil.copy(database, here / f'{turn}.db'))\n"
+        "    _features.match_pairs(here, again, _features.all_pairs(here))\n"
+        "    total = hashlib.sha256()\n"
+        "    with _pycolmap.pycolmap.Database.open(again) as db:\n"
+        "        numbers = sorted(image.image_id for image in db.read_all_images())\n"
+        "        pairs = [(a, b) for a in numbers for b in numbers if a < b]\n"
+        "        found = [np.asarray(db.read_matches(a, b)) for a, b in pairs]\n"
+        "    total.update(b''.join(matches.tobytes() for matches in found))\n"
+        "    print('matches', sum(map(len, found)) > 1000, total.hexdigest())\n"
+    )
+    command = [sys.executable, "-c", code, os.fspath(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    found = [line for line in done.stdout.splitlines() if line.startswith("matches True ")]
+    assert len(found) == 20
+    assert len(set(found)) == 1
+
+
 @needs_pycolmap
 def test_linear_algebra_takes_one_thread_whatever_the_environment_says() -> None:
     """How many threads a library takes while others work is a question of timing, and last bits follow it."""

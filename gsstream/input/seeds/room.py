@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +23,7 @@ from gsstream.core.projection import inside, project
 from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.input.seeds.fusion import agreement, world_points
 from gsstream.input.seeds.geometry import neighbour_views, pixel_centers, spread_views
-from gsstream.input.seeds.sweep import CPU
+from gsstream.input.seeds.surface import HALF, NOISE, Surface
 from gsstream.input.seeds.window import window_mean
 from gsstream.input.seeds.workers import one_thread_each
 
@@ -32,9 +31,6 @@ from gsstream.input.seeds.workers import one_thread_each
 AROUND = 90.0
 #: Most cameras that are used to find a room and to compare a pixel's place: the time grows with their pairs.
 MOST_CAMERAS = 8
-#: Standard deviation of grey from which a window counts as texture; half the width of the windows that are compared;
-#: and least number of places from which a score counts.
-NOISE, HALF, ENOUGH = 0.02, 3, 500
 #: Distance over which the middle of the sphere is drawn to the focus, as a share of the rig's size; and least radius of
 #: the sphere, as a share of the distance from its middle to the farthest camera.
 CENTER_SPREAD, INSIDE = 0.05, 0.93
@@ -70,8 +66,6 @@ class Search(NamedTuple):
 
 
 SPHERE, FLOOR = Search(111, 150, 0.98), Search(91, 60, 0.95)
-#: How well the pictures agree on a surface [R, S, 3].
-Agrees = Callable[[FloatArray], float]
 
 
 class Match(NamedTuple):
@@ -102,7 +96,6 @@ def with_room(
     accepted: BoolArray,
     given: BoolArray,
     tell: Tell = silent,
-    device: torch.device = CPU,
 ) -> tuple[FloatArray, BoolArray]:
     """Return depths [C, H, W] of which those of the room stand in where the sweep is not sure, and which are seeds.
 
@@ -115,10 +108,9 @@ def with_room(
         depths: [C, H, W] the same after interpolation where it was not sure.
         accepted: [C, H, W] bool, where enough views agree with ``depths``.
         given: [C, H, W] bool, pixels of depth maps: they stay as they are.
-        device: where the room is looked for.
     """
     support = agreement(swept, cameras, SUPPORT).support
-    room = room_depths(find_room(images, cameras, tell, device), cameras)
+    room = room_depths(find_room(images, cameras, tell), cameras)
     partners = neighbour_views(cameras, MOST_CAMERAS)
     depths, kept = depths.copy(), accepted & (given | (depths < IN_FRONT * room))
     for view in range(len(cameras)):
@@ -136,25 +128,22 @@ def with_room(
     return depths, kept
 
 
-def find_room(images: FloatArray, cameras: Cameras, tell: Tell = silent, device: torch.device = CPU) -> Room:
-    """Return the sphere and the floor on which pictures agree best, compared on ``device``.
-
-    The same for the same pictures and device.
-    """
+def find_room(images: FloatArray, cameras: Cameras, tell: Tell = silent) -> Room:
+    """Return the sphere and the floor on which pictures agree best; the same for the same pictures."""
     if len(cameras) > MOST_CAMERAS:
         chosen = spread_views(cameras, MOST_CAMERAS)
         images, cameras = images[chosen], cameras.select(chosen.tolist())
-    grey = torch.from_numpy(np.ascontiguousarray(images.mean(-1))).to(device)
+    grey = torch.from_numpy(np.ascontiguousarray(images.mean(-1)))
     focus = focus_point(cameras)
     size = float(np.linalg.norm(cameras.centers - focus, axis=1).mean())
     counted = itertools.count(1)
-    with one_thread_each() as pool:
 
-        def agrees(surface: FloatArray) -> float:
-            tell("looking for points: rooms tried", next(counted), SPHERE.total + FLOOR.total)
-            return surface_agreement(grey, cameras, surface, pool)
+    def tried() -> None:
+        tell("looking for points: rooms tried", next(counted), SPHERE.total + FLOOR.total)
 
-        return Room(*_sphere(agrees, cameras, focus, size), *_floor(agrees, cameras, focus, size))
+    with one_thread_each(1):
+        sphere = _sphere(grey, cameras, focus, size=size, tried=tried)
+        return Room(*sphere, *_floor(grey, cameras, focus, size=size, tried=tried))
 
 
 def room_depths(room: Room, cameras: Cameras) -> FloatArray:
@@ -179,25 +168,31 @@ def room_depths(room: Room, cameras: Cameras) -> FloatArray:
     return found.reshape(len(cameras), cameras.height, cameras.width)
 
 
-def _sphere(agrees: Agrees, cameras: Cameras, focus: FloatArray, size: float) -> tuple[FloatArray, float]:
+def _sphere(
+    grey: torch.Tensor, cameras: Cameras, focus: FloatArray, size: float, tried: Callable[[], None]
+) -> tuple[FloatArray, float]:
     """Middle and radius: about the focus, and no smaller than where the cameras stand."""
     latitude = (np.arange(72) + 0.5) / 72 * np.pi - np.pi / 2
     longitude = (np.arange(216) + 0.5) / 216 * 2 * np.pi
     a, b = np.meshgrid(latitude, longitude, indexing="ij")
     unit = np.stack([np.cos(a) * np.cos(b), np.cos(a) * np.sin(b), np.sin(a)], -1)
+    sphere = Surface.shaped(grey, cameras, unit)
 
     def score(values: FloatArray) -> float:
         if values[3] < INSIDE * np.linalg.norm(cameras.centers - values[:3], axis=1).max():
             return -1.0
+        tried()
         away = float(np.linalg.norm(values[:3] - focus)) / (CENTER_SPREAD * size)
-        return agrees(values[:3] + values[3] * unit) * float(np.exp(-0.5 * away**2))
+        return sphere.agreement(values[:3], float(values[3])) * float(np.exp(-0.5 * away**2))
 
     starts = [np.append(focus, radius) for radius in np.linspace(0.8, 3, SPHERE.starts) * size]
     best = _climb(score, starts, np.full(4, 0.04 * size), SPHERE)
     return best[:3], float(best[3])
 
 
-def _floor(agrees: Agrees, cameras: Cameras, focus: FloatArray, size: float) -> tuple[FloatArray, float]:
+def _floor(
+    grey: torch.Tensor, cameras: Cameras, focus: FloatArray, size: float, tried: Callable[[], None]
+) -> tuple[FloatArray, float]:
     """Upward normal, from cameras held level, and the height of a plane below every camera."""
     across = cameras.viewmats[:, 0, :3]
     up = np.linalg.eigh(across.T @ across)[1][:, 0]
@@ -207,12 +202,13 @@ def _floor(agrees: Agrees, cameras: Cameras, focus: FloatArray, size: float) -> 
     one = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     one /= np.linalg.norm(one)
     steps = ((np.arange(128) + 0.5) / 64 - 1) * 1.5 * size
-    flat = steps[:, None, None] * one + steps[None, :, None] * np.cross(up, one)
+    plane = Surface.shaped(grey, cameras, steps[:, None, None] * one + steps[None, :, None] * np.cross(up, one))
 
     def score(values: FloatArray) -> float:
         if values[0] > highest:
             return -1.0
-        return agrees(focus + flat + values[0] * up)
+        tried()
+        return plane.agreement(focus + values[0] * up)
 
     starts = [np.array([height]) for height in np.linspace(min(-1.2 * size, highest), highest, FLOOR.starts)]
     best = _climb(score, starts, np.array([0.01 * size]), FLOOR)
@@ -232,38 +228,6 @@ def _climb(
         if found > value:
             best, value = other, found
     return best
-
-
-def surface_agreement(grey: torch.Tensor, cameras: Cameras, surface: FloatArray, pool: ThreadPoolExecutor) -> float:
-    """Return how well pictures [C, H, W] agree on a surface [R, S, 3]: 0 to 1. It is computed where the pictures are.
-
-    It is the mean correlation, negative ones as 0, over all pairs of cameras and textured places; less where there are
-    few of them. The same for any number of workers.
-    """
-    points, shape, views = surface.reshape(-1, 3), surface.shape[:2], range(len(grey))
-    drawn = list(pool.map(lambda view: _drawn_on(grey[view], cameras, view, points=points, shape=shape), views))
-    shades, there = torch.stack([shade for shade, _ in drawn]), torch.stack([seen for _, seen in drawn])
-    means, squares = window_mean(torch.stack([shades, shades * shades], 1), HALF).unbind(1)
-    variance = (squares - means * means).clamp_min(0)
-    # A window counts where all of it lies in the picture.
-    usable = (window_mean(there.float()[:, None], HALF)[:, 0] > 0.99) & (variance > NOISE**2)
-    flat = usable.flatten(1).float()
-    places = (flat @ flat.T).cpu().tolist()
-    shared = {view: [other for other in views[view + 1 :] if places[view][other]] for view in views}
-    total = sum(places[view][other] for view, others in shared.items() for other in others)
-    if not total:
-        return 0.0
-
-    def compared(view: int) -> torch.Tensor:
-        others = torch.tensor(shared[view]).to(grey.device)
-        both = usable[view] & usable[others]
-        cross = window_mean((shades[view] * shades[others])[:, None], HALF)[:, 0] - means[view] * means[others]
-        same = cross / ((variance[view] + NOISE**2) * (variance[others] + NOISE**2)).sqrt()
-        return same.clamp_min(0).masked_fill(~both, 0).sum(dtype=torch.float64)
-
-    good = float(torch.stack(list(pool.map(compared, filter(shared.get, views)))).sum())
-    score: float = good / total * min(1.0, total / ENOUGH)
-    return score
 
 
 def _match(images: FloatArray, cameras: Cameras, view: int, depth: FloatArray, others: list[int]) -> Match:
@@ -291,8 +255,7 @@ def _drawn_on(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """A picture [H, W] drawn on places [P, 3]: an image of ``shape`` (P pixels), and which of its pixels are drawn."""
     uv, depth = project(points, cameras, view)
-    grid = torch.from_numpy((uv / (cameras.width, cameras.height) * 2 - 1).astype(np.float32)).to(grey.device)
-    grid = grid.reshape(1, *shape, 2)
+    grid = torch.from_numpy((uv / (cameras.width, cameras.height) * 2 - 1).astype(np.float32)).reshape(1, *shape, 2)
     drawn = F.grid_sample(grey[None, None], grid, align_corners=False, padding_mode="border")[0, 0]
     there = inside(uv, depth, cameras) & (depth > cameras.near_plane)
-    return drawn, torch.from_numpy(there.reshape(shape)).to(grey.device)
+    return drawn, torch.from_numpy(there.reshape(shape))

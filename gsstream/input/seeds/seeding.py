@@ -87,9 +87,7 @@ def photo_consistent_seeds(
     accepted |= given
     if stands_around(cameras):
         origin += " and the room that they stand in"
-        depths, accepted = with_room(
-            images, cameras, swept, depths=depths, accepted=accepted, given=given, tell=tell, device=settings.device
-        )
+        depths, accepted = with_room(images, cameras, swept, depths=depths, accepted=accepted, given=given, tell=tell)
     xyz = np.concatenate([world_points(depths, cameras, i)[accepted[i].reshape(-1)] for i in range(len(cameras))])
     common = np.clip(images / gains[:, None, None, :], 0, 1)
     cloud = PointCloud(xyz.astype(np.float32), common[accepted], origin)

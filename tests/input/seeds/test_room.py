@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
 import torch
 from rigs import HEIGHT, WIDTH, in_line, inwards, looking, on_arc, outwards, parallel
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import map_coordinates, uniform_filter
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.focus import focus_point
-from gsstream.core.projection import project
+from gsstream.core.projection import inside, project
 from gsstream.engine.run.encoder import one_torch_thread
 from gsstream.input.seeds import room
 from gsstream.input.seeds.fusion import world_points
@@ -24,15 +25,13 @@ from gsstream.input.seeds.room import (
     find_room,
     room_depths,
     stands_around,
-    surface_agreement,
     with_room,
 )
 from gsstream.input.seeds.seeding import photo_consistent_seeds
 from gsstream.input.seeds.shell import BEYOND, RADIUS, SEEDS, find_shell, in_shell, mean_color, shell_points
 from gsstream.input.seeds.shell import WIDTH as OVERLAP
+from gsstream.input.seeds.surface import ENOUGH, HALF, NOISE, Surface
 from gsstream.input.seeds.window import window_mean
-from gsstream.input.seeds.workers import one_thread_each
-from gsstream.testing.pretend import AVAILABLE, NAME
 
 #: A little off what the cameras look at.
 TRUTH = Room(np.array([0.05, -0.04, 0.02]), 3.3, np.array([0.0, 0.0, 1.0]), -0.7)
@@ -124,24 +123,76 @@ def test_the_room_is_found_from_its_pictures_and_again(found: Room) -> None:
     assert [np.asarray(value).tobytes() for value in again] == [np.asarray(value).tobytes() for value in found]
 
 
+#: A square of places of which the middle is the origin.
+STEPS = np.linspace(-2, 2, 40)
+FLAT = np.stack(np.meshgrid(STEPS, STEPS, [0.0], indexing="ij"), -1)[:, :, 0]
+#: Places all around, as a globe has them.
+ROUND = np.stack(
+    [
+        np.outer(np.cos(a := np.linspace(-1.5, 1.5, 30)), turn(b))
+        for b in [np.linspace(0, 6.2, 70)]
+        for turn in (np.cos, np.sin)
+    ]
+    + [np.outer(np.sin(a), np.ones(70))],
+    -1,
+)
+
+
 def test_pictures_agree_on_the_true_surface_only() -> None:
     grey = torch.from_numpy(photograph(TRUTH, DOME).mean(-1))
-    steps = np.linspace(-2, 2, 40)
-    flat = np.stack(np.meshgrid(steps, steps, [0.0], indexing="ij"), -1)[:, :, 0]
-    with one_thread_each(2) as pool:
-        heights = (-1.1, -0.7, -0.3)
-        scores = {z: surface_agreement(grey, DOME, flat + np.array([0, 0, z]), pool) for z in heights}
-        black = surface_agreement(torch.zeros_like(grey), DOME, flat, pool)
+    heights = (-1.1, -0.7, -0.3)
+    scores = {z: Surface.shaped(grey, DOME, FLAT).agreement(np.array([0, 0, z])) for z in heights}
     assert scores[-0.7] > 0.8 > 2 * max(scores[-1.1], scores[-0.3])
+    black = Surface.shaped(torch.zeros_like(grey), DOME, FLAT).agreement(np.zeros(3))
     assert black == 0, "black pictures agree on nothing"
 
 
-@pytest.mark.skipif(not AVAILABLE, reason="needs a process in which torch sees no GPU")
-def test_pictures_of_a_device_that_takes_no_tensor_of_another_agree_as_those_of_the_processor(found: Room) -> None:
-    images = photograph(TRUTH, DOME)
-    there = find_room(images, DOME, device=torch.device(NAME))
-    for value, wanted in zip(there, found, strict=True):
-        np.testing.assert_allclose(value, wanted, rtol=1e-5, atol=1e-6)
+#: Cameras that look level to all sides, and so past every place of a plane.
+AWAY = outwards(16)
+
+
+def looked_up(picture: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """What a picture shows at pixels [N, 2] whose origin is a corner, in between linearly."""
+    return map_coordinates(picture.astype(np.float64), [uv[:, 1] - 0.5, uv[:, 0] - 0.5], order=1, mode="nearest")
+
+
+def agreement_of_whole_surfaces(grey: np.ndarray, cameras: Cameras, surface: np.ndarray) -> float:
+    """What the agreement is by definition: every camera drawn on all of a surface, every pair compared on all of it."""
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.asarray(uniform_filter(values.astype(np.float64), 2 * HALF + 1, mode="nearest"))
+
+    drawn = []
+    for view in range(len(cameras)):
+        uv, depth = project(surface.reshape(-1, 3), cameras, view)
+        seen = inside(uv, depth, cameras) & (depth > cameras.near_plane)
+        shade = np.where(seen, looked_up(grey[view], uv), 0).reshape(surface.shape[:2])
+        spread = np.maximum(mean(shade**2) - mean(shade) ** 2, 0)
+        drawn.append((shade, spread, (mean(seen.reshape(shade.shape)) > 0.99) & (spread > NOISE**2)))
+    same = []
+    for (one, its, here), (other, others, there) in combinations(drawn, 2):
+        shared = (mean(one * other) - mean(one) * mean(other)) / np.sqrt((its + NOISE**2) * (others + NOISE**2))
+        same.append(np.maximum(shared, 0)[here & there])
+    all_of_them = np.concatenate(same)
+    return float(all_of_them.mean() * min(1, len(all_of_them) / ENOUGH)) if len(all_of_them) else 0.0
+
+
+@pytest.mark.parametrize("shape", [FLAT, ROUND], ids=["a plane", "a sphere"])
+@pytest.mark.parametrize(
+    "cameras",
+    [DOME, inwards(6, 360), inwards(2, 180), AWAY, parallel(5), replace(DOME, near_plane=2.8)],
+    ids=["dome", "ring", "two", "outwards", "side by side", "far near plane"],
+)
+def test_pictures_agree_as_by_definition_wherever_the_surface_lies(cameras: Cameras, shape: np.ndarray) -> None:
+    grey = photograph(TRUTH, DOME).mean(-1)[np.arange(len(cameras)) % len(DOME)]
+    surface = Surface.shaped(torch.from_numpy(grey), cameras, shape)
+    all_found = []
+    for shift, scale in (([0, 0, -0.7], 1.0), ([0.1, -0.3, 0.2], 3.3), ([0, 0, 0], 0.9), ([2.9, 0.5, 0], 1.4)):
+        found = surface.agreement(np.array(shift), scale)
+        expected = agreement_of_whole_surfaces(grey, cameras, np.array(shift) + scale * shape)
+        assert found == pytest.approx(expected, rel=1e-3, abs=1e-5)
+        all_found.append(found)
+    assert (max(all_found) > 0.001) == (cameras is not AWAY or shape is not FLAT)
 
 
 @pytest.fixture

@@ -63,8 +63,11 @@ def test_d(): ...
 """
 
 
-@pytest.mark.parametrize("workers", [[], ["-n", "1"]], ids=["alone", "worker"])
-@pytest.mark.parametrize(("most", "code"), [("2", 1), ("3", 0), (None, 0)])
+@pytest.mark.parametrize(
+    ("most", "code", "workers"),
+    [("2", 1, []), ("2", 1, ["-n", "1"]), ("3", 0, []), (None, 0, [])],
+    ids=["one too many", "one too many, a worker", "as many as may be", "no limit"],
+)
 def test_more_skipped_than_may_be_fails_and_says_what_to_install(
     tmp_path: Path, most: str | None, code: int, workers: list[str]
 ) -> None:

@@ -172,7 +172,8 @@ class VideoClip:
                 f"{display_matrix(frame)}, the first was {self._stored[0]} x {self._stored[1]}, {self._matrix}; "
                 "re-encode the video at one size"
             )
-        pixels: np.ndarray[Any, Any] = frame.to_ndarray(format="rgb48le" if self.deep else "rgb24")
+        # One thread, or each picture starts and ends a pool of them, one for each processor, which takes milliseconds.
+        pixels: np.ndarray[Any, Any] = frame.to_ndarray(format="rgb48le" if self.deep else "rgb24", threads=1)
         return upright(pixels, self._matrix, self._path)
 
     def _drop(self) -> None:

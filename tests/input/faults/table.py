@@ -211,7 +211,7 @@ def pictures_of(path: Path) -> np.ndarray:
     import av
 
     with av.open(str(path)) as file:
-        return np.stack([frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)])
+        return np.stack([frame.to_ndarray(format="rgb24", threads=1) for frame in file.decode(video=0)])
 
 
 def quicker(path: Path) -> None:

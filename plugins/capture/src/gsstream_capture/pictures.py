@@ -51,7 +51,7 @@ class CameraPlan:
 
 def pixels_of(frame: Any, rotate: int = 0) -> np.ndarray[Any, Any]:
     """Return [H, W, 3] uint8 of a decoded frame, blue first as OpenCV has it, turned ``rotate`` degrees clockwise."""
-    pixels = frame.to_ndarray(format="bgr24")
+    pixels = frame.to_ndarray(format="bgr24", threads=1)  # without a pool of threads for each picture
     return np.ascontiguousarray(np.rot90(pixels, -rotate // 90)) if rotate else pixels
 
 

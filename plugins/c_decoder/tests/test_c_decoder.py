@@ -83,16 +83,8 @@ def test_vectors_and_mutants_under_sanitisers(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["s2gs-edge", "stream3dgs"])
 def test_a_stream_of_a_real_run(dump: Path, tmp_path: Path, method: str) -> None:
-    run = [
-        str(Path(sys.executable).with_name("gsstream")),
-        "run",
-        "--source",
-        "demo",
-        "--method",
-        method,
-        "--frames",
-        "2",
-    ]
+    run = [str(Path(sys.executable).with_name("gsstream")), "run", "--source", "demo", "--method", method]
+    run += ["--frames", "2", "--set", "first_frame.max_iterations=200"]
     run += ["--out", str(tmp_path / "run"), "--no-pictures", "--quiet"]
     done = subprocess.run(run, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stderr

@@ -178,6 +178,23 @@ def test_points_lie_on_the_true_surfaces_and_repeat() -> None:
     assert mapping.triangulate_points(images, cameras).xyz.tobytes() == points.xyz.tobytes()
 
 
+IN_ITS_PROCESS = (
+    "import sys, hashlib, shutil, zlib\n"
+    "from pathlib import Path\n"
+    "from gsstream.input.seeds import _features, _pycolmap\n"
+    "import numpy as np\n"
+    "here = Path(sys.argv[1])\n"
+)
+
+
+def printed_of_pycolmap(code: str, folder: Path, *arguments: str) -> list[str]:
+    """What the lines after IN_ITS_PROCESS print, in a process of their own that may load pycolmap."""
+    command = [sys.executable, "-c", IN_ITS_PROCESS + code, os.fspath(folder), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
 @pytest.mark.sfm
 @needs_pycolmap
 def test_no_number_of_threads_changes_a_bit_of_a_point(tmp_path: Path) -> None:
@@ -186,11 +203,6 @@ def test_no_number_of_threads_changes_a_bit_of_a_point(tmp_path: Path) -> None:
     sfm.write_images(tmp_path, source.frame(0).images)
     sfm.write_rig(tmp_path, source.info.train)
     code = (
-        "import sys, hashlib, shutil, zlib\n"
-        "from pathlib import Path\n"
-        "from gsstream.input.seeds import _features, _pycolmap\n"
-        "import numpy as np\n"
-        "here = Path(sys.argv[1])\n"
         "for threads in map(int, sys.argv[2:]):\n"
         "    folder = here / f'{threads}'\n"
         "    shutil.copytree(here / 'images', folder / 'images')\n"
@@ -201,10 +213,8 @@ def test_no_number_of_threads_changes_a_bit_of_a_point(tmp_path: Path) -> None:
         "        sums = {name: hashlib.sha256(found[name].tobytes()).hexdigest() for name in sorted(found)}\n"
         "    print('points', len(found.files), sums)\n"
     )
-    command = [sys.executable, "-c", code, os.fspath(tmp_path), "1", "2", "3", "16"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    found = [line for line in done.stdout.splitlines() if line.startswith("points 7 ")]
+    printed = printed_of_pycolmap(code, tmp_path, "1", "2", "3", "16")
+    found = [line for line in printed if line.startswith("points 7 ")]
     assert len(found) == 4
     assert len(set(found)) == 1
 
@@ -215,11 +225,6 @@ def test_the_same_features_are_matched_alike_twenty_times(tmp_path: Path) -> Non
     """Several threads of pycolmap's matching disturb each other, now and then: one matching in fifty came out other."""
     sfm.write_images(tmp_path, SyntheticSource.from_query("width=320&height=240&views=8").frame(0).images)
     code = (
-        "import sys, hashlib, shutil, zlib\n"
-        "from pathlib import Path\n"
-        "from gsstream.input.seeds import _features, _pycolmap\n"
-        "import numpy as np\n"
-        "here = Path(sys.argv[1])\n"
         "_features.processors = lambda: 4\n"
         "database = _features.extract(here, most=2048)\n"
         "for turn in range(20):\n"
@@ -233,10 +238,7 @@ def test_the_same_features_are_matched_alike_twenty_times(tmp_path: Path) -> Non
         "    total.update(b''.join(matches.tobytes() for matches in found))\n"
         "    print('matches', sum(map(len, found)) > 1000, total.hexdigest())\n"
     )
-    command = [sys.executable, "-c", code, os.fspath(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    found = [line for line in done.stdout.splitlines() if line.startswith("matches True ")]
+    found = [line for line in printed_of_pycolmap(code, tmp_path) if line.startswith("matches True ")]
     assert len(found) == 20
     assert len(set(found)) == 1
 

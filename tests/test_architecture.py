@@ -105,7 +105,8 @@ def test_functions_are_short_and_repair_nothing_in_silence() -> None:
         if isinstance(node, ast.Attribute) and node.attr == "nan_to_num":
             yield f"{node.lineno}: nan_to_num hides the cause"
         named = {keyword.arg for keyword in node.keywords} if isinstance(node, ast.Call) else set()
-        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(".to_ndarray") and "threads" not in named:
+        called = ast.unparse(node.func).rpartition(".")[2] if isinstance(node, ast.Call) else ""
+        if called in ("to_ndarray", "to_image", "to_rgb", "reformat") and "threads" not in named:
             yield f"{node.lineno}: without threads=1 each picture of a film starts a pool of threads"
 
     trees = {path.relative_to(ROOT): ast.parse(path.read_text(encoding="utf-8")) for path in LIBRARY}

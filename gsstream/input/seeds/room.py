@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 
 from gsstream.core.cameras import Cameras
 from gsstream.core.focus import focus_point
@@ -23,9 +22,9 @@ from gsstream.core.projection import inside, project
 from gsstream.core.shapes import BoolArray, FloatArray
 from gsstream.input.seeds.fusion import agreement, world_points
 from gsstream.input.seeds.geometry import neighbour_views, pixel_centers, spread_views
-from gsstream.input.seeds.surface import HALF, NOISE, Surface
+from gsstream.input.seeds.surface import HALF, NOISE, Surface, picture_at
 from gsstream.input.seeds.window import window_mean
-from gsstream.input.seeds.workers import one_thread_each
+from gsstream.input.seeds.workers import one_thread
 
 #: Degrees between two cameras, seen from what all look at, above which a rig stands in the room that it looks into.
 AROUND = 90.0
@@ -111,15 +110,15 @@ def with_room(
     """
     support = agreement(swept, cameras, SUPPORT).support
     room = room_depths(find_room(images, cameras, tell), cameras)
-    partners = neighbour_views(cameras, MOST_CAMERAS)
+    grey, partners = torch.from_numpy(images.mean(-1)), neighbour_views(cameras, MOST_CAMERAS)
     depths, kept = depths.copy(), accepted & (given | (depths < IN_FRONT * room))
     for view in range(len(cameras)):
-        match = _match(images, cameras, view, depth=swept[view], others=partners[view].tolist())
+        match = _match(grey, cameras, view, depth=swept[view], others=partners[view].tolist())
         more = ~given[view] & ~kept[view] & (swept[view] < CLEARLY_IN_FRONT * room[view]) & (support[view] >= 1)
         more &= match.best > CONFIRMED
         depths[view][more] = swept[view][more]
         kept[view] |= more
-        wall = _match(images, cameras, view, depth=room[view], others=partners[view].tolist())
+        wall = _match(grey, cameras, view, depth=room[view], others=partners[view].tolist())
         contradicted = wall.seen & (wall.best < CONTRADICTED) & (wall.texture > NOISE)
         taken = ~given[view] & ~kept[view] & ~contradicted
         depths[view][taken] = room[view][taken]
@@ -141,7 +140,7 @@ def find_room(images: FloatArray, cameras: Cameras, tell: Tell = silent) -> Room
     def tried() -> None:
         tell("looking for points: rooms tried", next(counted), SPHERE.total + FLOOR.total)
 
-    with one_thread_each(1):
+    with one_thread():
         sphere = _sphere(grey, cameras, focus, size=size, tried=tried)
         return Room(*sphere, *_floor(grey, cameras, focus, size=size, tried=tried))
 
@@ -230,18 +229,16 @@ def _climb(
     return best
 
 
-def _match(images: FloatArray, cameras: Cameras, view: int, depth: FloatArray, others: list[int]) -> Match:
-    """Compare a view's pixels, taken to lie at ``depth`` [H, W], with other views."""
+def _match(grey: torch.Tensor, cameras: Cameras, view: int, depth: FloatArray, others: list[int]) -> Match:
+    """Compare a view's pixels, taken to lie at ``depth`` [H, W], with other views of the pictures [C, H, W]."""
     stack = np.broadcast_to(depth.astype(np.float64), (len(cameras), *depth.shape))
     points = world_points(stack, cameras, view)
-    own = torch.from_numpy(images[view].mean(-1))
+    own = grey[view]
     mean, square = window_mean(torch.stack([own, own * own])[:, None], HALF)[:, 0]
     variance = (square - mean * mean).clamp_min(0)
     best, seen = torch.full(depth.shape, -1.0), torch.zeros(depth.shape, dtype=torch.bool)
     for other in others:
-        shade, there = _drawn_on(
-            torch.from_numpy(images[other].mean(-1)), cameras, other, points=points, shape=depth.shape
-        )
+        shade, there = _drawn_on(grey[other], cameras, other, points=points, shape=depth.shape)
         moments = window_mean(torch.stack([shade, shade * shade, shade * own])[:, None], HALF)[:, 0]
         spread = (moments[1] - moments[0] ** 2).clamp_min(0)
         same = (moments[2] - moments[0] * mean) / ((variance + NOISE**2) * (spread + NOISE**2)).sqrt()
@@ -255,7 +252,5 @@ def _drawn_on(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """A picture [H, W] drawn on places [P, 3]: an image of ``shape`` (P pixels), and which of its pixels are drawn."""
     uv, depth = project(points, cameras, view)
-    grid = torch.from_numpy((uv / (cameras.width, cameras.height) * 2 - 1).astype(np.float32)).reshape(1, *shape, 2)
-    drawn = F.grid_sample(grey[None, None], grid, align_corners=False, padding_mode="border")[0, 0]
     there = inside(uv, depth, cameras) & (depth > cameras.near_plane)
-    return drawn, torch.from_numpy(there.reshape(shape))
+    return picture_at(grey, uv.reshape(*shape, 2)), torch.from_numpy(there.reshape(shape))

@@ -49,12 +49,13 @@ class Surface:
         are few of them.
         """
         places, seen = self._places(shift, scale)
-        drawn = torch.zeros(3, *seen.shape)
-        shades, means, variance = drawn.unbind(0)
+        shades, means, variance = torch.zeros(3, *seen.shape)
         usable = torch.zeros(seen.shape, dtype=torch.bool)
         for view in np.flatnonzero(seen.any((1, 2))).tolist():
             part = (view, *_grown(seen[view]))
-            shade = self._shade(view, places[:, *part])
+            x, y, depth = places[:, *part]
+            near = depth.clip(min=self.cameras.near_plane)  # what lies behind has any colour, and is not seen
+            shade = picture_at(self.grey[view], np.stack([x / near, y / near], -1))
             layers = torch.stack([shade, shade * shade, torch.from_numpy(seen[part]).float()])
             mean, square, whole = window_mean(layers[:, None], HALF)[:, 0]
             shades[part], means[part], variance[part] = shade, mean, (square - mean * mean).clamp_min(0)
@@ -82,17 +83,14 @@ class Surface:
         seen &= (x < cameras.width * depth) & (y < cameras.height * depth)
         return places, seen
 
-    def _shade(self, view: int, places: FloatArray) -> torch.Tensor:
-        """A picture drawn on places [3, r, s]: [r, s]. Where it does not reach, or behind the camera, of any colour."""
-        x, y, depth = places
-        depth = depth.clip(min=self.cameras.near_plane)
-        grid = np.stack([x / (depth * self.cameras.width), y / (depth * self.cameras.height)], -1) * 2 - 1
-        return F.grid_sample(
-            self.grey[view][None, None],
-            torch.from_numpy(grid.astype(np.float32))[None],
-            align_corners=False,
-            padding_mode="border",
-        )[0, 0]
+
+def picture_at(grey: torch.Tensor, uv: FloatArray) -> torch.Tensor:
+    """Return what a picture [H, W] shows at pixels [R, S, 2] (pixel-corner origin), in between linearly: [R, S].
+
+    Beyond its border it shows what lies there.
+    """
+    grid = (uv / grey.shape[::-1] * 2 - 1).astype(np.float32)[None]
+    return F.grid_sample(grey[None, None], torch.from_numpy(grid), align_corners=False, padding_mode="border")[0, 0]
 
 
 def _grown(marked: BoolArray) -> tuple[slice, slice]:

@@ -15,16 +15,22 @@ MOST = 4
 
 
 @contextmanager
-def one_thread_each(workers: int = 0) -> Iterator[ThreadPoolExecutor]:
-    """Give a pool of threads, and let torch run on one thread inside and outside of it: a second thread within a small
-    operation costs more time than it saves. 0 workers: one for each processor, at most MOST.
-    """
+def one_thread() -> Iterator[None]:
+    """Let torch run on one thread: a second one within a small operation costs more time than it saves."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with ThreadPoolExecutor(
-            workers or min(processors(), MOST), initializer=torch.set_num_threads, initargs=(1,)
-        ) as pool:
-            yield pool
+        yield
     finally:
         torch.set_num_threads(threads)
+
+
+@contextmanager
+def one_thread_each(workers: int = 0) -> Iterator[ThreadPoolExecutor]:
+    """Give a pool of threads, and let torch run on one thread inside and outside of it.
+
+    0 workers: one for each processor, at most MOST.
+    """
+    number = workers or min(processors(), MOST)
+    with one_thread(), ThreadPoolExecutor(number, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        yield pool

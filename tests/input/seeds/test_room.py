@@ -127,15 +127,8 @@ def test_the_room_is_found_from_its_pictures_and_again(found: Room) -> None:
 STEPS = np.linspace(-2, 2, 40)
 FLAT = np.stack(np.meshgrid(STEPS, STEPS, [0.0], indexing="ij"), -1)[:, :, 0]
 #: Places all around, as a globe has them.
-ROUND = np.stack(
-    [
-        np.outer(np.cos(a := np.linspace(-1.5, 1.5, 30)), turn(b))
-        for b in [np.linspace(0, 6.2, 70)]
-        for turn in (np.cos, np.sin)
-    ]
-    + [np.outer(np.sin(a), np.ones(70))],
-    -1,
-)
+HEIGHTS, TURNS = np.meshgrid(np.linspace(-1.5, 1.5, 30), np.linspace(0, 6.2, 70), indexing="ij")
+ROUND = np.stack([np.cos(HEIGHTS) * np.cos(TURNS), np.cos(HEIGHTS) * np.sin(TURNS), np.sin(HEIGHTS)], -1)
 
 
 def test_pictures_agree_on_the_true_surface_only() -> None:

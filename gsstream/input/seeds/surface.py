@@ -87,7 +87,7 @@ class Surface:
 def picture_at(grey: torch.Tensor, uv: FloatArray) -> torch.Tensor:
     """Return what a picture [H, W] shows at pixels [R, S, 2] (pixel-corner origin), in between linearly: [R, S].
 
-    Beyond its border it shows what lies there.
+    Beyond its border it shows what the border does.
     """
     grid = (uv / grey.shape[::-1] * 2 - 1).astype(np.float32)[None]
     return F.grid_sample(grey[None, None], torch.from_numpy(grid), align_corners=False, padding_mode="border")[0, 0]
